@@ -1,0 +1,1 @@
+"""Controllers and the trial protocol they plug into."""

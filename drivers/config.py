@@ -1,0 +1,86 @@
+"""The station file as a model: the simulated world where there is one, the bus, the devices, the tags on the table."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from drivers.scene import Strict, TagMount, Vector3
+
+
+class WorldConfig(Strict):
+    """The simulated world. ``profile`` names the mismatch between the plant and what the planner believes of it."""
+
+    profile: str = "ideal"
+    stiffness_scale: float = Field(1.0, gt=0, description="the plant's stiffness over the planner's")
+    clock: Literal["lockstep", "realtime"] = "lockstep"
+    timestep: float = Field(0.001, gt=0, le=0.002, description="plant step [s]")
+
+
+class BusConfig(Strict):
+    """Where the station's processes meet."""
+
+    endpoint: str = Field("tcp/127.0.0.1:7447", pattern=r"^(tcp|tls)/.+:\d+$")
+    timeout: float = Field(5.0, gt=0, description="longest wait for a reply [s]")
+
+
+class _Device(Strict):
+    backend: Literal["sim"] = "sim"
+    serial: str = "sim"
+
+
+class ArmConfig(_Device):
+    """A position-controlled arm."""
+
+    kind: Literal["arm"]
+    rate: float = Field(100.0, gt=0, le=1000)
+
+
+class GripperConfig(_Device):
+    """A two-finger gripper."""
+
+    kind: Literal["gripper"]
+    rate: float = Field(20.0, gt=0, le=1000)
+
+
+class ForceTorqueConfig(_Device):
+    """A force/torque sensor. ``pose`` is X_ee_sensor for a wrist mount, X_W_sensor for a table mount."""
+
+    kind: Literal["force_torque"]
+    mount: Literal["wrist", "table"]
+    rate: float = Field(1000.0, gt=0, le=1000)
+    pose: Vector3 = (0.0, 0.0, 0.0)
+
+
+class TagCameraConfig(_Device):
+    """A camera that sees the tags. ``position`` and ``look_at`` [m] are in the 3-D world (x right, y away, z up)."""
+
+    kind: Literal["tag_camera"]
+    rate: float = Field(10.0, gt=0, le=60)
+    width: int = Field(1280, ge=64, le=4096)
+    height: int = Field(720, ge=64, le=4096)
+    focal: float = Field(1400.0, gt=0, description="focal length [px]")
+    position: Vector3
+    look_at: Vector3
+
+
+DeviceConfig = Annotated[ArmConfig | GripperConfig | ForceTorqueConfig | TagCameraConfig, Field(discriminator="kind")]
+
+
+class LogConfig(Strict):
+    """What goes into the log: ``omit`` names streams to leave out, ``flush`` its period to disk [s]."""
+
+    omit: tuple[str, ...] = ()
+    flush: float = Field(0.5, gt=0, le=0.5)
+
+
+class StationConfig(Strict):
+    """A station: its devices, where they meet, and, in simulation, the world behind them."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    world: WorldConfig | None = None
+    bus: BusConfig = BusConfig()
+    devices: dict[str, DeviceConfig]
+    table_tags: tuple[TagMount, ...] = ()
+    log: LogConfig = LogConfig()

@@ -1,0 +1,1 @@
+"""The simulated station: a MuJoCo plant and the simulated devices around it."""

@@ -1,0 +1,1 @@
+"""Experiment files, the runner, metrics, the report and the command line."""

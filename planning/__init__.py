@@ -1,0 +1,1 @@
+"""Contact programs, skills and plans."""

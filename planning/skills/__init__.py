@@ -1,0 +1,1 @@
+"""The manipulation skills of the paper, one file each."""
