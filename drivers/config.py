@@ -13,16 +13,16 @@ class WorldConfig(Strict):
     """The simulated world. ``profile`` names the mismatch between the plant and what the planner believes of it."""
 
     profile: str = "ideal"
-    stiffness_scale: float = Field(1.0, gt=0, description="the plant's stiffness over the planner's")
+    stiffness_scale: float = Field(default=1.0, gt=0, description="the plant's stiffness over the planner's")
     clock: Literal["lockstep", "realtime"] = "lockstep"
-    timestep: float = Field(0.001, gt=0, le=0.002, description="plant step [s]")
+    timestep: float = Field(default=0.001, gt=0, le=0.002, description="plant step [s]")
 
 
 class BusConfig(Strict):
     """Where the station's processes meet."""
 
-    endpoint: str = Field("tcp/127.0.0.1:7447", pattern=r"^(tcp|tls)/.+:\d+$")
-    timeout: float = Field(5.0, gt=0, description="longest wait for a reply [s]")
+    endpoint: str = Field(default="tcp/127.0.0.1:7447", pattern=r"^(tcp|tls)/.+:\d+$")
+    timeout: float = Field(default=5.0, gt=0, description="longest wait for a reply [s]")
 
 
 class _Device(Strict):
@@ -34,14 +34,14 @@ class ArmConfig(_Device):
     """A position-controlled arm."""
 
     kind: Literal["arm"]
-    rate: float = Field(100.0, gt=0, le=1000)
+    rate: float = Field(default=100.0, gt=0, le=1000)
 
 
 class GripperConfig(_Device):
     """A two-finger gripper."""
 
     kind: Literal["gripper"]
-    rate: float = Field(20.0, gt=0, le=1000)
+    rate: float = Field(default=20.0, gt=0, le=1000)
 
 
 class ForceTorqueConfig(_Device):
@@ -49,7 +49,7 @@ class ForceTorqueConfig(_Device):
 
     kind: Literal["force_torque"]
     mount: Literal["wrist", "table"]
-    rate: float = Field(1000.0, gt=0, le=1000)
+    rate: float = Field(default=1000.0, gt=0, le=1000)
     pose: Vector3 = (0.0, 0.0, 0.0)
 
 
@@ -57,10 +57,10 @@ class TagCameraConfig(_Device):
     """A camera that sees the tags. ``position`` and ``look_at`` [m] are in the 3-D world (x right, y away, z up)."""
 
     kind: Literal["tag_camera"]
-    rate: float = Field(10.0, gt=0, le=60)
-    width: int = Field(1280, ge=64, le=4096)
-    height: int = Field(720, ge=64, le=4096)
-    focal: float = Field(1400.0, gt=0, description="focal length [px]")
+    rate: float = Field(default=10.0, gt=0, le=60)
+    width: int = Field(default=1280, ge=64, le=4096)
+    height: int = Field(default=720, ge=64, le=4096)
+    focal: float = Field(default=1400.0, gt=0, description="focal length [px]")
     position: Vector3
     look_at: Vector3
 
@@ -72,7 +72,7 @@ class LogConfig(Strict):
     """What goes into the log: ``omit`` names streams to leave out, ``flush`` its period to disk [s]."""
 
     omit: tuple[str, ...] = ()
-    flush: float = Field(0.5, gt=0, le=0.5)
+    flush: float = Field(default=0.5, gt=0, le=0.5)
 
 
 class StationConfig(Strict):

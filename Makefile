@@ -1,0 +1,54 @@
+# Everything a newcomer needs: `make demo`, `make test`, `make check`. Each sets up what it needs first.
+# Paths are relative, so that a checkout path with a space in it works.
+
+PYTHON ?= python3
+BIN := .venv/bin
+export OMP_NUM_THREADS ?= 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help setup browser demo test test-slow check format clean
+
+help:  ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+
+.venv/.installed: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "extrinsic needs Python 3.11 or newer; set PYTHON=")'
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@echo "setting up .venv (about two minutes on a fresh machine) ..."
+	@$(BIN)/python -m pip install --quiet -e '.[dev]'
+	@touch $@
+
+setup: .venv/.installed  ## create .venv and install the project into it
+
+browser:
+	@if ! command -v chromium >/dev/null 2>&1 && ! command -v google-chrome >/dev/null 2>&1; then \
+	  if command -v apt-get >/dev/null 2>&1 && [ "$$(id -u)" = 0 ]; then \
+	    echo "installing chromium (the tests look at the report with it) ..."; \
+	    (apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -yq --no-install-recommends chromium) >/dev/null 2>&1 \
+	      || echo "could not install chromium; the tests that look at pages will be skipped"; \
+	  else \
+	    echo "the tests that look at pages need chromium and are skipped without it: sudo apt-get install chromium"; \
+	  fi; \
+	fi
+
+demo: setup  ## plan, execute and report grasped pivoting on the simulated station
+	@$(BIN)/extrinsic run experiments/grasped_pivoting.yaml
+
+test: setup browser  ## the default test suite
+	@$(BIN)/python -m pytest
+
+test-slow: setup browser  ## the long tests
+	@$(BIN)/python -m pytest -m slow --timeout=1800
+
+check: setup  ## lint, types and the layers
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/lint-imports
+	@$(BIN)/pyright
+
+format: setup  ## format the code
+	@$(BIN)/ruff format .
+	@$(BIN)/ruff check --fix .
+
+clean:  ## remove what the targets made, but not runs/
+	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache

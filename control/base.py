@@ -1,0 +1,51 @@
+"""What every controller is: a law that turns measurements into a correction of the planned end-effector poses.
+
+The correction ``c`` (3,) = (x, y, θ) [m, m, rad] lives in gocf, like the elasticity's displacement: the commanded
+pose at waypoint k is go_k ⊕ X_go_gocf ⊕ (K⁻¹ w_k + c).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+import numpy as np
+
+from mechanics import se2
+from mechanics.readings import Array
+from mechanics.records import PlanarState
+from planning.plan import Plan
+
+
+class Controller(ABC):
+    """A control law. One instance runs one trial."""
+
+    name: ClassVar[str]
+    #: whether the law acts on measurements: it then gets a free-air phase and a correction at every waypoint
+    feedback: ClassVar[bool] = True
+
+    def __init__(self, plan: Plan):
+        self.plan = plan
+        self.correction = np.zeros(3)
+
+    @abstractmethod
+    def in_air(self, go_desired: Array, measured: PlanarState) -> None:
+        """Update the correction before touch-down, where only the pose can be wrong."""
+
+    @abstractmethod
+    def in_contact(self, go_desired: Array, wrench_desired: Array, measured: PlanarState) -> None:
+        """Update the correction at a settled waypoint with the desired go pose and wrench (3,) in W."""
+
+    def command(self, go: Array, ee: Array) -> Array:
+        """The pose (3,) to command where the plan has the go at ``go`` and the end-effector at ``ee``."""
+        X_W_gocf = se2.compose(go, self.plan.X_go_gocf)
+        return se2.compose(X_W_gocf, se2.between(X_W_gocf, ee) + self.correction)
+
+
+CONTROLLERS: dict[str, type[Controller]] = {}
+
+
+def register(controller: type[Controller]) -> type[Controller]:
+    """Make a controller available to experiment files under its name."""
+    CONTROLLERS[controller.name] = controller
+    return controller

@@ -1,0 +1,72 @@
+"""Streaming a path to the arm: quintic ramps, holds, and waiting until the readings have settled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from drivers.interfaces import Arm, ArmTarget, Clock
+from mechanics import se2
+from mechanics.readings import Array
+
+
+def quintic(s: float) -> tuple[float, float]:
+    """Position and slope of the minimum-jerk ramp from 0 to 1 at ``s`` in [0, 1]: 10 s³ − 15 s⁴ + 6 s⁵."""
+    return s**3 * (10 - 15 * s + 6 * s * s), 30 * s * s * (1 - s) ** 2
+
+
+class Mover:
+    """Sends set-points at ``rate`` [Hz]; every motion starts where the last one ended."""
+
+    def __init__(self, arm: Arm, clock: Clock, rate: float, start: Array, speed: float):
+        """``start`` (3,) is the present pose of the end-effector, ``speed`` [m/s] the mean speed of free motions."""
+        self.pose = np.asarray(start, float)
+        self.speed = speed
+        self._arm, self._clock, self._period = arm, clock, 1.0 / rate
+        self._sequence = 0
+        self.on_tick: Callable[[Array], None] = lambda _pose: None
+
+    def _send(self, pose: Array, twist: Array) -> None:
+        self._sequence += 1
+        self._arm.command(ArmTarget(pose, twist, self._period, self._sequence))
+        self.pose = pose
+        self.on_tick(pose)
+        self._clock.sleep(self._period)
+
+    def ramp(self, goal: Array, seconds: float) -> None:
+        """Move to ``goal`` (3,) along a straight line in (x, y, θ) with a quintic time law, taking ``seconds``."""
+        start = self.pose
+        step = np.asarray(goal, float) - start
+        step[2] = se2.wrap(step[2])
+        ticks = max(1, round(seconds / self._period))
+        for i in range(1, ticks + 1):
+            s, slope = quintic(i / ticks)
+            self._send(start + s * step, slope * step / (ticks * self._period))
+
+    def through(self, path: Array, seconds: float) -> None:
+        """Move along the polyline ``path`` (M, 3), one minimum-jerk time law over the whole, taking ``seconds``.
+
+        The path is a function of its index (a force level, say), so the speed between its points follows their spacing.
+        """
+        points = np.concatenate([self.pose[None], np.asarray(path, float)])
+        points[:, 2] = np.unwrap(points[:, 2])
+        ticks = max(1, round(seconds / self._period))
+        for i in range(1, ticks + 1):
+            s, slope = quintic(i / ticks)
+            at = s * (len(points) - 1)
+            k = min(int(at), len(points) - 2)
+            segment = points[k + 1] - points[k]
+            twist = segment * slope * (len(points) - 1) / (ticks * self._period)
+            self._send(points[k] + (at - k) * segment, twist)
+
+    def travel(self, goal: Array) -> None:
+        """Move to ``goal`` in free air at the mover's speed (60 deg/s for turns), never faster than 0.2 s."""
+        step = np.asarray(goal, float) - self.pose
+        seconds = max(0.2, float(np.hypot(step[0], step[1])) / self.speed, abs(float(se2.wrap(step[2]))) / np.pi * 3)
+        self.ramp(goal, seconds)
+
+    def rest(self, seconds: float) -> None:
+        """Stay for ``seconds``, repeating the set-point so that no watchdog mistakes a pause for a dead commander."""
+        for _ in range(max(1, round(seconds / self._period))):
+            self._send(self.pose, np.zeros(3))

@@ -1,0 +1,71 @@
+"""What the station measures at a settled instant: the arm gives ee, tags the objects, the wrist sensor the wrench."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.errors import DeviceTimeout
+from drivers.interfaces import Arm, ForceTorqueSensor, TagCamera
+from estimation.force_torque import FreeAirLoad, WristSensor, mean_wrench
+from estimation.tag_pose import TagPose, estimate_planar_pose
+from mechanics import se2
+from mechanics.camera import CameraModel, TagGeometry
+from mechanics.readings import Array, TagDetection
+from mechanics.records import PlanarState
+
+
+@dataclass
+class Observer:
+    """Reads the devices and turns readings into poses and wrenches in W. Never sees the plant's truth.
+
+    ``tags`` maps a body (``table``, ``go``, ``eo``) to the tags it carries; ``grasp`` is X_go_gocf; ``window_ns`` is
+    how far back wrench readings are averaged.
+    """
+
+    arm: Arm
+    wrist: ForceTorqueSensor
+    camera: TagCamera
+    camera_model: CameraModel
+    tags: dict[str, tuple[TagGeometry, ...]]
+    wrist_sensor: WristSensor
+    grasp: Array
+    window_ns: int
+    frames: int = 1
+
+    def see(self, bodies: tuple[str, ...]) -> dict[str, TagPose | None]:
+        """Poses in W of the named bodies from fresh camera frames; None where none of its tags was seen."""
+        detections: list[TagDetection] = []
+        for _ in range(self.frames):
+            detections += self.camera.capture().detections
+        return {
+            body: estimate_planar_pose(self.camera_model, tuple(detections), self.tags.get(body, ())) for body in bodies
+        }
+
+    def mean_reading(self) -> Array:
+        """Mean (6,) of the wrist readings of the last window."""
+        now = self.wrist.latest().stamp.capture_ns
+        readings = self.wrist.since(now - self.window_ns)
+        try:
+            return mean_wrench(readings)
+        except ValueError as reason:
+            raise DeviceTimeout(
+                self.wrist.name, "average the wrench", str(reason), "Check the sensor's status and cable"
+            ) from None
+
+    def measure(self) -> PlanarState:
+        """Everything at this instant; the arm should be at rest."""
+        ee = self.arm.latest()
+        reading = self.mean_reading()
+        seen = self.see(("go", "eo"))
+        go = None if seen["go"] is None else seen["go"].pose
+        eo = None if seen["eo"] is None else seen["eo"].pose
+        grasp_centre = se2.compose(ee.pose if go is None else go, np.zeros(3) if go is None else self.grasp)
+        wrench = self.wrist_sensor.wrench_on_go(reading, ee.pose, grasp_centre[:2])
+        return PlanarState(ee.pose, go, eo, wrench)
+
+    def zero(self, load: FreeAirLoad, X_W_go: Array) -> None:
+        """Take the wrist sensor's offset in free air, with the go at ``X_W_go`` and only its weight on the sensor."""
+        ee = self.arm.latest().pose
+        self.wrist_sensor = self.wrist_sensor.zeroed(self.mean_reading(), ee, X_W_go, self.grasp, load)

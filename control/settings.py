@@ -1,0 +1,31 @@
+"""The figures of the trial protocol, as they stand under ``trial:`` in an experiment file."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class TrialSettings(BaseModel):
+    """How a plan is executed. SI unless the name says otherwise."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    control_rate: float = Field(50.0, ge=10, le=1000, description="set-points sent to the arm [Hz]")
+    ramp: float = Field(0.2, gt=0, le=10, description="duration of the quintic ramp between waypoints [s]")
+    settle: float = Field(0.1, ge=0, le=10, description="shortest hold at a waypoint [s]")
+    settle_timeout: float = Field(2.0, gt=0, le=60, description="longest wait for the wrench to come to rest [s]")
+    settle_force: float = Field(0.01, gt=0, description="change of the mean force from one window to the next [N]")
+    window: float = Field(0.1, gt=0, le=2, description="averaging window of the wrench [s]")
+    tag_frames: int = Field(1, ge=1, le=100, description="camera frames averaged per measurement")
+    corrections: int = Field(1, ge=0, le=10, description="feedback updates at a waypoint before it is recorded")
+    air_corrections: int = Field(3, ge=0, le=20, description="pose updates in free air before touch-down")
+    preload: float = Field(1.0, gt=0, le=30, description="duration of the force ramp at fixed object pose [s]")
+    clearance_mm: float = Field(10.0, gt=0, le=200, description="height of the object above touch before and after")
+    approach_speed: float = Field(0.05, gt=0, le=0.5, description="mean speed of free motions [m/s]")
+    touch_speed: float = Field(0.01, gt=0, le=0.1, description="mean speed of the descent to touch [m/s]")
+    start_tolerance_mm: float = Field(
+        5.0, gt=0, description="largest deviation of the grasp from the plan at the start"
+    )
+    start_tolerance_deg: float = Field(5.0, gt=0)
+    slip_tolerance_mm: float = Field(5.0, gt=0, description="motion of a sticking contact that ends the trial")
+    force_limit: float = Field(30.0, gt=0, description="measured force that ends the trial [N]")

@@ -1,0 +1,223 @@
+"""The trial protocol: approach, preload at fixed pose, the trajectory waypoint by waypoint, unload, retreat.
+
+Every trial of every skill and controller runs through here, on the simulated station as on a real one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from control.base import Controller
+from control.monitor import ContactMonitor
+from control.motion import Mover
+from control.observe import Observer
+from control.settings import TrialSettings
+from drivers.errors import CommandRefused, DriverError
+from drivers.interfaces import Clock
+from estimation.force_torque import FreeAirLoad
+from mechanics import se2
+from mechanics.readings import Array
+from mechanics.records import PlanarState, WaypointRecord
+from planning.plan import Plan
+
+
+@dataclass
+class TrialResult:
+    """How a trial ended (statuses of design §6) and what it recorded. ``plan`` is the plan as anchored."""
+
+    status: str
+    reason: str
+    plan: Plan
+    waypoints: list[WaypointRecord] = field(default_factory=list)
+
+
+@dataclass
+class Watch:
+    """Who looks on while a trial runs. Each is called in the control thread and must not block."""
+
+    waypoint: Callable[[WaypointRecord], None] = lambda _waypoint: None
+    phase: Callable[[str, float], None] = lambda _name, _fraction: None
+    event: Callable[[str, str], None] = lambda _level, _text: None
+    #: asks a person to reset the scene and says whether they did; a station without a person answers False
+    reset_scene: Callable[[str], bool] = lambda _what: False
+
+
+class _Ended(Exception):
+    def __init__(self, status: str, reason: str):
+        self.status, self.reason = status, reason
+        super().__init__(reason)
+
+
+class Trial:
+    """One execution of ``plan`` under ``controller``. The arm's lease must be held by the caller."""
+
+    def __init__(
+        self,
+        name: str,
+        plan: Plan,
+        controller: Callable[[Plan], Controller],
+        observer: Observer,
+        clock: Clock,
+        load: FreeAirLoad,
+        settings: TrialSettings,
+        watch: Watch,
+    ):
+        self._name, self._nominal, self._make_controller = name, plan, controller
+        self._observer, self._clock, self._load = observer, clock, load
+        self._settings, self._watch = settings, watch
+        self._result = TrialResult("completed", "", plan)
+        self._mover = Mover(
+            observer.arm, clock, settings.control_rate, observer.arm.latest().pose, settings.approach_speed
+        )
+
+    def run(self) -> TrialResult:
+        """Run the whole protocol. A device failure ends it ``device_failed``, a refusal or a limit ``stopped``."""
+        result = self._result
+        try:
+            self._protocol()
+        except _Ended as end:
+            result.status, result.reason = end.status, end.reason
+            self._leave()
+        except CommandRefused as error:
+            result.status, result.reason = "stopped", str(error)
+        except DriverError as error:
+            result.status, result.reason = "device_failed", str(error)
+        if result.status != "completed":
+            self._watch.event("error", f"{result.status}: {result.reason}")
+        return result
+
+    # -- the phases ----------------------------------------------------------------------------------------------
+
+    def _protocol(self) -> None:
+        s, mover = self._settings, self._mover
+        self._watch.phase("approach", 0.0)
+        go_air = self._lifted(self._nominal.preload_go[0])
+        self._go_above(self._nominal.free_air_ee(go_air))
+        self._settle()
+        plan = self._anchored(go_air)
+        self._result.plan = plan
+        controller = self._make_controller(plan)
+        monitor = ContactMonitor(plan, s.slip_tolerance_mm * 1e-3, s.force_limit)
+
+        go_air = self._lifted(plan.preload_go[0])
+        ee_air = plan.free_air_ee(go_air)
+        mover.travel(controller.command(go_air, ee_air))
+        self._settle()
+        if controller.feedback:
+            self._converge_in_air(controller, go_air, ee_air)
+
+        self._watch.phase("preload", 0.0)
+        touch = controller.command(plan.preload_go[0], plan.preload_ee[0])
+        mover.ramp(touch, s.clearance_mm * 1e-3 / s.touch_speed)
+        path = [controller.command(go, ee) for go, ee in zip(plan.preload_go, plan.preload_ee, strict=True)]
+        mover.through(np.array(path), s.preload)
+
+        weight = np.array([0.0, -self._load.mass * self._load.gravity])
+        steps = len(plan.ee)
+        for k in range(steps):
+            self._watch.phase("trajectory", k / steps)
+            measured, commanded = self._visit(controller, plan, k)
+            planned = PlanarState(plan.ee[k], plan.go[k], None if plan.eo is None else plan.eo[k], plan.wrench[k])
+            record = WaypointRecord(self._clock.now_ns(), self._name, k, planned, commanded, measured)
+            self._result.waypoints.append(record)
+            self._watch.waypoint(record)
+            deviation = monitor.check(k, measured, weight)
+            if deviation is not None:
+                raise _Ended(deviation.status, deviation.reason)
+
+        self._watch.phase("unload", 0.0)
+        path = [controller.command(go, ee) for go, ee in zip(plan.unload_go, plan.unload_ee, strict=True)]
+        mover.through(np.array(path), s.preload)
+        self._leave()
+        self._watch.phase("done", 1.0)
+
+    def _visit(self, controller: Controller, plan: Plan, k: int) -> tuple[PlanarState, Array]:
+        """Go to waypoint ``k``, let the controller correct it, and measure once settled."""
+        s, mover = self._settings, self._mover
+        mover.ramp(controller.command(plan.go[k], plan.ee[k]), s.ramp)
+        self._settle()
+        for _ in range(s.corrections if controller.feedback else 0):
+            controller.in_contact(plan.go[k], plan.wrench[k], self._observer.measure())
+            mover.ramp(controller.command(plan.go[k], plan.ee[k]), s.ramp)
+            self._settle()
+        return self._observer.measure(), mover.pose
+
+    def _converge_in_air(self, controller: Controller, go: Array, ee: Array) -> None:
+        for _ in range(self._settings.air_corrections):
+            before = controller.correction
+            controller.in_air(go, self._observer.measure())
+            self._mover.travel(controller.command(go, ee))
+            self._settle()
+            if np.hypot(*(controller.correction - before)[:2]) < 2e-5:
+                break
+
+    def _anchored(self, go_expected: Array) -> Plan:
+        """Verify the start by tags, zero the wrist sensor under the go's weight, and anchor the plan to the table."""
+        for attempt in range(2):
+            seen = self._observer.see(("table", "go"))
+            problem = self._start_problem(seen, go_expected)
+            if problem is None:
+                break
+            self._watch.event("warning", problem)
+            if attempt or not self._watch.reset_scene(problem):
+                raise _Ended("stopped", f"the start could not be verified: {problem}")
+        table, go = seen["table"], seen["go"]
+        assert table is not None and go is not None  # _start_problem saw both
+        self._observer.zero(self._load, go.pose)
+        return self._nominal.reanchored(table.pose)
+
+    def _start_problem(self, seen: dict, go_expected: Array) -> str | None:
+        s = self._settings
+        for body in ("table", "go"):
+            if seen[body] is None:
+                return f"no tag of '{body}' is in view"
+        off = se2.between(go_expected, seen["go"].pose)
+        distance, angle = float(np.hypot(off[0], off[1])) * 1e3, abs(float(np.degrees(off[2])))
+        if distance > s.start_tolerance_mm or angle > s.start_tolerance_deg:
+            return (
+                f"the grasped object is {distance:.1f} mm and {angle:.1f} deg from where the grasp should have it "
+                f"(tolerance {s.start_tolerance_mm:g} mm, {s.start_tolerance_deg:g} deg)"
+            )
+        return None
+
+    # -- motions -------------------------------------------------------------------------------------------------
+
+    def _lifted(self, pose: Array) -> Array:
+        return pose + np.array([0.0, self._settings.clearance_mm * 1e-3, 0.0])
+
+    def _go_above(self, goal: Array) -> None:
+        """Travel to ``goal`` in free air: first up, then across, then down, so that nothing is swept off the table."""
+        here = self._mover.pose
+        height = max(here[1], goal[1])
+        for pose in ([here[0], height, here[2]], [goal[0], height, goal[2]], goal):
+            if np.abs(np.asarray(pose) - self._mover.pose).max() > 1e-6:
+                self._mover.travel(np.asarray(pose, float))
+
+    def _settle(self) -> None:
+        """Hold until the mean wrench of two windows in a row agrees, or the time-out, which is reported."""
+        s = self._settings
+        self._mover.rest(max(s.settle, s.window))
+        waited = s.settle
+        before = self._observer.mean_reading()
+        while True:
+            self._mover.rest(s.window)
+            waited += s.window
+            now = self._observer.mean_reading()
+            if np.abs(now - before)[:3].max() < s.settle_force:
+                return
+            if waited > s.settle_timeout:
+                self._watch.event(
+                    "warning",
+                    f"not settled after {waited:.1f} s: force still moves {np.abs(now - before)[:3].max():.3f} N",
+                )
+                return
+            before = now
+
+    def _leave(self) -> None:
+        """Lift the go off the table from wherever the trial ended."""
+        self._watch.phase("retreat", 0.0)
+        up = self._mover.pose + np.array([0.0, 2 * self._settings.clearance_mm * 1e-3, 0.0])
+        self._mover.travel(up)

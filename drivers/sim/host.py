@@ -1,0 +1,297 @@
+"""The process that owns the simulated world and serves its devices on the bus.
+
+The main thread owns the world. Handlers of the bus only put work into its inbox; in lockstep the world advances when
+it is asked to, in real time it is paced by absolute deadlines with work done between the steps.
+
+As a process of its own it reads one line of JSON from standard input (``{"config": …, "orphan": bool}``), answers with
+one line (``{"ready": pid}`` or ``{"error": …}``) and ends when standard input does, at SIGTERM or SIGINT: arm held,
+session closed, exit code 0.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import logging
+import os
+import queue
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+from pydantic import ValidationError
+
+from drivers.config import StationConfig, WorldConfig
+from drivers.errors import CommandRefused, DriverError, NotConnected
+from drivers.interfaces import Arm, ImagingSensor
+from drivers.scene import Scene
+from drivers.sim.world import World
+from drivers.wire import messages, topics
+from drivers.wire.arm_server import ArmServer
+from drivers.wire.bus import Bus
+from drivers.wire.codec import encode_reading
+from drivers.wire.server import Answer, Desk, DeviceServer, Work
+
+PROTOCOL = 1
+TRUTH_PERIOD_NS = 20_000_000
+"""Truth is published at 50 Hz of station time; in lockstep urgent work also waits no longer than this."""
+_PIECE = 0.002  # how much real time is simulated at once [s]
+_IDLE = 0.5
+_LAG = 0.25  # a world that is this late gives up the lost time [s]
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class _Camera:
+    server: DeviceServer
+    period: float
+    due: float = 0.0
+
+
+class Inbox:
+    """Work for the owner of the world; urgent work overtakes. `put` and `wake` are safe in signal handlers."""
+
+    def __init__(self) -> None:
+        self._urgent: deque[Work] = deque()
+        self._queue: queue.SimpleQueue[Work | None] = queue.SimpleQueue()
+
+    def put(self, work: Work, urgent: bool) -> None:
+        """Leave work for the owner."""
+        if urgent:
+            self._urgent.append(work)
+            self._queue.put(None)
+        else:
+            self._queue.put(work)
+
+    def wake(self) -> None:
+        """Make `serve` return early."""
+        self._queue.put(None)
+
+    def serve_urgent(self) -> None:
+        """Do the urgent work."""
+        while self._urgent:
+            self._urgent.popleft()()
+
+    def serve(self, timeout: float) -> None:
+        """Wait for work and do one piece of it."""
+        self.serve_urgent()
+        try:
+            work = self._queue.get(timeout=timeout) if timeout > 0 else self._queue.get_nowait()
+        except queue.Empty:
+            return
+        self.serve_urgent()
+        if work is not None:
+            work()
+
+
+class Host:
+    """The world on a bus. `run` blocks in the calling thread, which owns the world, until `stop`."""
+
+    def __init__(self, config: StationConfig, bus: Bus):
+        self.config, self.bus = config, bus
+        self.world = World(config)
+        self.inbox = Inbox()
+        self.skipped_ns = 0
+        self.desk = Desk(
+            bus,
+            config.name,
+            run=self.inbox.put,
+            now_ns=self._now_ns,
+            shift_ns=lambda: self.skipped_ns,
+            lossless=self.world.lockstep,
+        )
+        self._stopping = False
+        self._staged = False
+        self._anchor = 0.0  # monotonic instant at which the world should have been at step 0
+        self._origin_ns = 0
+        self._truths = self._next_truth_ns = 0
+        self._arms: list[ArmServer] = []
+        self._cameras: list[_Camera] = []
+
+    def _now_ns(self) -> int:
+        return self.world.now_ns() + self.skipped_ns
+
+    def stop(self) -> None:
+        """End `run`; safe in a signal handler and from any thread."""
+        self._stopping = True
+        self.inbox.wake()
+
+    def run(self, ready: Callable[[], None] = lambda: None) -> None:
+        """Serve until `stop`; ``ready`` is called once every device is on the bus."""
+        with ExitStack() as stack:
+            for name, device in self.world.devices.items():
+                server = ArmServer(self.desk, device) if isinstance(device, Arm) else DeviceServer(self.desk, device)
+                stack.enter_context(server)
+                if isinstance(server, ArmServer):
+                    self._arms.append(server)
+                elif isinstance(device, ImagingSensor):
+                    self._cameras.append(_Camera(server, 1.0 / self.config.devices[name].rate))
+            self._truth_stream = self.desk.publisher(topics.WORLD, "truth", messages.TRUTH)
+            stack.callback(self._truth_stream.close)
+            for verb, work in (
+                ("reset", self._reset),
+                ("advance", self._advance),
+                ("truth", self._truth),
+                ("counts", lambda _: Answer(json.dumps(self.desk.counts()))),
+            ):
+                stack.callback(self.desk.serve(topics.WORLD, verb, work))
+            stack.callback(self.desk.serve(topics.WORLD, "describe", self._describe, direct=True))
+            token = self.bus.token(topics.alive(self.config.name, topics.WORLD))
+            stack.callback(token.undeclare)
+            ready()
+            while not self._stopping:
+                wait = _IDLE if self.world.lockstep or not self._staged else self._pace()
+                self.inbox.serve(wait)
+
+    def _pace(self) -> float:
+        """Bring the world up to the present; returns how long to wait for the next piece [s]."""
+        simulated = (self.world.now_ns() - self._origin_ns) * 1e-9
+        behind = time.monotonic() - self._anchor - simulated
+        if behind > _LAG:
+            self._anchor += behind
+            self.skipped_ns += int(behind * 1e9)
+            log.warning("%s: the world was %.0f ms late and gave up the lost time", self.config.name, behind * 1e3)
+            behind = 0.0
+        if behind < _PIECE:
+            return _PIECE - behind
+        self._step(int(_PIECE * 1e9))
+        for camera in self._cameras:
+            if simulated >= camera.due:
+                camera.due = simulated + camera.period
+                camera.server.capture_if_wanted()
+        return 0.0
+
+    def _step(self, span_ns: int) -> None:
+        """Advance by ``span_ns``, with the truth at its instants and urgent work no longer than its period away."""
+        while span_ns > 0:
+            piece = min(span_ns, max(self._next_truth_ns - (self.world.now_ns() - self._origin_ns), 1))
+            self.world.advance(piece * 1e-9)
+            span_ns -= piece
+            self._publish_truth()
+            self.inbox.serve_urgent()
+
+    def _publish_truth(self) -> None:
+        if self.world.now_ns() - self._origin_ns < self._next_truth_ns:
+            return
+        self._next_truth_ns += TRUTH_PERIOD_NS
+        if self._truth_stream.matched:
+            truth = self.world.truth()
+            payload = encode_reading(truth, self.skipped_ns)
+            self._truth_stream.put(payload, self._truths, truth.stamp.capture_ns + self.skipped_ns)
+        self._truths += 1
+
+    def _describe(self, _: bytes) -> Answer:
+        return Answer(
+            json.dumps(
+                {
+                    "protocol": PROTOCOL,
+                    "station": self.config.name,
+                    "pid": os.getpid(),
+                    "lockstep": self.world.lockstep,
+                    "config": self.config.model_dump(mode="json"),
+                }
+            )
+        )
+
+    def _reset(self, payload: bytes) -> None:
+        asked = messages.decode(payload, messages.RESET)
+        for server in self._arms:
+            other = server.foreign_commander(asked.session)
+            if other is not None:
+                raise CommandRefused(
+                    topics.WORLD, "reset", f"{other} commands {server.device.name}", "Wait until its run has ended"
+                )
+        self.desk.restart()
+        try:
+            scene = Scene.model_validate_json(asked.scene)
+            world = WorldConfig.model_validate_json(asked.world) if asked.world else None
+            self.world.reset(asked.seed, scene, world)
+        except (ValidationError, ValueError) as error:
+            raise CommandRefused(topics.WORLD, "reset", str(error), "Correct the scene") from error
+        self.skipped_ns = 0
+        self._origin_ns, self._anchor = self.world.now_ns(), time.monotonic()
+        self._truths = self._next_truth_ns = 0
+        self._staged = True
+        for camera in self._cameras:
+            camera.due = 0.0
+        self._publish_truth()
+
+    def _advance(self, payload: bytes) -> None:
+        span_ns = messages.stamp_ns(messages.decode(payload, messages.DURATION))
+        if not self.world.lockstep:
+            raise CommandRefused(topics.WORLD, "advance", "the clock is real time", "Wait instead")
+        if span_ns < 0:
+            raise CommandRefused(topics.WORLD, "advance", "time does not run backwards", "Ask for a positive time")
+        self.world.plant("world", "advance")
+        self._step(span_ns)
+
+    def _truth(self, _: bytes) -> Answer:
+        return Answer(type=messages.TRUTH, data=encode_reading(self.world.truth(), self.skipped_ns))
+
+
+def serve(config: StationConfig, ready: Callable[[Host], None] = lambda _: None) -> int:
+    """Serve a simulated station in this process until SIGTERM or SIGINT; returns 0. Raises NotConnected, ValueError."""
+    with Bus(config.bus.endpoint, listen=True, timeout=config.bus.timeout, shared_memory=False) as bus:
+        host = Host(config, bus)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: host.stop())
+        host.run(lambda: ready(host))
+    return 0
+
+
+def _end_with_input(host: Host) -> None:
+    """Stop the host when the parent has gone and standard input with it."""
+    while os.read(0, 1):
+        pass
+    host.stop()
+
+
+def _die_with_parent() -> None:
+    """Have the kernel send SIGTERM when the parent dies: covers a pipe that a third process keeps open."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGTERM, 0, 0, 0)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry of the process that a `drivers.station.Station` starts; ``argv`` is unused, all comes by the pipe."""
+    line = bytearray()
+    while not line.endswith(b"\n"):
+        byte = os.read(0, 1)
+        if not byte:
+            return 2
+        line += byte
+
+    def tell(**said: object) -> None:
+        sys.stdout.write(json.dumps(said) + "\n")
+        sys.stdout.flush()
+
+    try:
+        order = json.loads(line)
+        config = StationConfig.model_validate(order["config"])
+        if order.get("bound", False):
+            _die_with_parent()
+
+        def ready(host: Host) -> None:
+            threading.Thread(target=_end_with_input, args=(host,), name="parent", daemon=True).start()
+            tell(ready=os.getpid())
+
+        serve(config, ready)
+    except NotConnected as error:
+        tell(error=error.got, device=error.device, asked=error.asked, remedy=error.remedy)
+        return 3
+    except (DriverError, ValueError, KeyError) as error:
+        log.exception("the host failed")
+        tell(error=str(error), device="world", asked="serve", remedy="")
+        return 3
+    return 0
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
+    sys.exit(main())

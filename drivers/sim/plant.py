@@ -1,0 +1,279 @@
+"""The simulated world's physics: MuJoCo bodies and contacts, and the compliant fingers that hold the grasped object."""
+
+from __future__ import annotations
+
+from math import ceil, cos, sin
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from drivers.errors import DeviceFault
+from drivers.scene import Scene
+from drivers.sim.coupling import Coupling, Grip
+from drivers.sim.model import build, mujoco, polar_inertia
+from mechanics.polygon import Polygon
+from mechanics.readings import Array, ContactTruth
+
+#: a contact that moves along its face faster than this [m/s] slips; a sticking one creeps at some nm/s
+SLIP_SPEED = 1e-4
+#: contact points of one pair of bodies closer than this [m] in the task plane are one contact (of two depths)
+SAME_POINT = 1e-4
+#: beyond these the state is nonsense: metres or radians, and their rates
+FARTHEST, FASTEST = 20.0, 200.0
+#: the largest product of the go's fastest natural frequency and the step that the explicit coupling may see
+RESOLVED = 0.45
+
+Pose = tuple[float, float, float]
+ZERO: Pose = (0.0, 0.0, 0.0)
+
+
+class Plant:
+    """A go held by compliant fingers of a kinematic end-effector, an eo where there is one, and the ground y = 0.
+
+    Poses are (x, y, θ) in W, wrenches (fx, fy, τ) in axes of W. One call of `step` is one plant step; the order of
+    calls alone decides the state, to the last bit. Forces are those of the newest step, which began ``timestep``
+    before the present poses.
+    """
+
+    def __init__(self, scene: Scene, stiffness_scale: float = 1.0, timestep: float = 0.001):
+        """Compile the scene; `reset` comes next and is called here once.
+
+        Raises ValueError for a scene that cannot be: no friction for a pair, a stiffness that is not positive
+        definite, bodies that overlap each other or the ground.
+        """
+        if scene.extrinsic is not None and scene.extrinsic_pose is None:
+            raise ValueError("scene.extrinsic_pose: missing; an extrinsic body needs its pose in W")
+        self.scene, self.timestep = scene, timestep
+        self._inertia = polar_inertia(scene.grasped)
+        self._stiffness = np.array(scene.stiffness) * stiffness_scale
+        self._initial_coupling = self._coupling_at(scene.grasp)
+        self._substeps = max(1, ceil(self._initial_coupling.fastest * timestep / RESOLVED))
+        self.model = build(scene, timestep / self._substeps)
+        self.data = mujoco.MjData(self.model)
+        self._has_eo = scene.extrinsic is not None
+        self._owner = [self._body_of(i) for i in range(self.model.ngeom)]
+        d = self.data
+        self._qpos, self._qvel, self._applied, self._reaction = d.qpos, d.qvel, d.qfrc_applied, d.qfrc_constraint
+        self._force = np.zeros(6)
+        self.reset()
+
+    def _coupling_at(self, grasp: ArrayLike) -> Coupling:
+        return Coupling(self._stiffness, grasp, self.scene.grasped.mass, self._inertia)
+
+    def _body_of(self, geom: int) -> str:
+        return self.model.geom(geom).name.rstrip("0123456789")
+
+    # -- time ----------------------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Back to the start: ee at rest at ``scene.start``, the go hanging from it at rest in free air."""
+        mujoco.mj_resetData(self.model, self.data)
+        self.coupling = self._initial_coupling
+        self.held = True
+        self.steps = 0
+        self._fault: DeviceFault | None = None
+        #: how often the number of contact points has changed: a contact that flickers at rest is a sick one
+        self.contact_changes = 0
+        self._ee: Pose = self.scene.start
+        self._ee_twist: Pose = ZERO
+        self._qpos[:3] = self.coupling.sagged(self._ee, self.scene.gravity)
+        if self._has_eo:
+            self._qpos[3:6] = self.scene.extrinsic_pose
+        self._observe()
+        self._apply()
+        mujoco.mj_forward(self.model, self.data)
+        self._state_of_forces = self._state
+        self._contact_points = self.data.ncon
+        self._refuse_overlap()
+
+    def step(self, X_W_ee: Pose, V_W_ee: Pose) -> None:
+        """Advance by one step, at whose end the ee is at ``X_W_ee`` with the twist ``V_W_ee``; all floats in W.
+
+        Raises DeviceFault when the state has diverged, and again until `reset`.
+        """
+        if self._fault is not None:
+            raise self._fault
+        if self._substeps == 1:
+            self._step(X_W_ee, V_W_ee)
+        else:
+            start = self._ee
+            for i in range(1, self._substeps):
+                s = i / self._substeps
+                x, y, theta = (a + s * (b - a) for a, b in zip(start, X_W_ee, strict=True))
+                self._step((x, y, theta), V_W_ee)
+            self._step(X_W_ee, V_W_ee)
+        self.steps += 1
+
+    def _step(self, ee: Pose, ee_twist: Pose) -> None:
+        self._apply()
+        self._state_of_forces = self._state
+        mujoco.mj_step(self.model, self.data)
+        self._ee, self._ee_twist = ee, ee_twist
+        self._observe()
+        if self.data.ncon != self._contact_points:
+            self._contact_points = self.data.ncon
+            self.contact_changes += 1
+
+    def _observe(self) -> None:
+        """Take the new state over and find the grip that acts in it."""
+        q, v = self._qpos.tolist(), self._qvel.tolist()
+        # sums, which a NaN poisons, and compared so that a NaN fails
+        if not (sum(map(abs, q)) < FARTHEST and sum(map(abs, v)) < FASTEST):
+            self._diverged(f"the bodies are at {np.round(q, 3).tolist()}")
+        self._state = q
+        if self.held:
+            self._grip = self.coupling.grip(tuple(q[:3]), tuple(v[:3]), self._ee, self._ee_twist)
+        else:
+            self._grip = Grip(0.0, 0.0, 0.0, *self.coupling.grasp_pose(q[:3])[:2])
+
+    def _apply(self) -> None:
+        grip, q = self._grip, self._state
+        fx, fy, tau = grip.fx, grip.fy, grip.torque_about(q[0], q[1])
+        if not abs(fx) + abs(fy) + abs(tau) < 1e6:
+            self._diverged(f"the fingers push with ({fx:.3g}, {fy:.3g}) N, {tau:.3g} N·m")
+        applied = self._applied
+        applied[0], applied[1], applied[2] = fx, fy, tau
+
+    def _diverged(self, what: str) -> None:
+        self._fault = DeviceFault(
+            "world",
+            f"step {self.steps} at {self.steps * self.timestep:.3f} s",
+            f"the simulated state has diverged: {what}",
+            "Reset the world; the commanded motion was too fast or pressed too deep",
+            recoverable=True,
+        )
+        raise self._fault
+
+    def _refuse_overlap(self) -> None:
+        for i in range(self.data.ncon):
+            contact = self.data.contact[i]
+            pair = sorted(self._owner[g] for g in contact.geom)
+            if "go" in pair or contact.dist < -1e-4:
+                raise ValueError(
+                    f"scene: {pair[0]} and {pair[1]} overlap by {-contact.dist * 1e3:.3g} mm at the start; "
+                    f"raise scene.start or move scene.extrinsic_pose"
+                )
+
+    # -- the fingers ---------------------------------------------------------------------------------------------
+
+    def release(self) -> None:
+        """Open the fingers: the go falls."""
+        self.held = False
+        self._observe()
+
+    def grasp(self) -> bool:
+        """Close the fingers on the go wherever it now is; tells whether it was between them.
+
+        The new grasp has zero wrench at the present poses.
+        """
+        if not self.held:
+            x, y, angle = self._state[:3]
+            dx, dy = self._ee[0] - x, self._ee[1] - y
+            c, s = cos(angle), sin(angle)
+            grasp = np.array([c * dx + s * dy, c * dy - s * dx, self._ee[2] - angle])
+            inside = Polygon(np.asarray(self.scene.grasped.vertices)).signed_distance(grasp[:2]) < 0
+            if inside:
+                self.coupling = self._coupling_at(grasp)
+                self.held = True
+                self._observe()
+        return self.held
+
+    # -- what the plant knows ------------------------------------------------------------------------------------
+
+    @property
+    def ee_pose(self) -> Pose:
+        """X_W_ee in floats."""
+        return self._ee
+
+    @property
+    def ee(self) -> Array:
+        """X_W_ee (3,)."""
+        return np.array(self._ee)
+
+    @property
+    def go(self) -> Array:
+        """X_W_go (3,)."""
+        return np.array(self._state[:3])
+
+    @property
+    def eo(self) -> Array | None:
+        """X_W_eo (3,), or None where there is no extrinsic object."""
+        return np.array(self._state[3:6]) if self._has_eo else None
+
+    @property
+    def grip(self) -> Grip:
+        """The wrench of the fingers on the go at the present state, in scalars."""
+        return self._grip
+
+    def coupling_wrench(self, p_W: ArrayLike | None = None) -> Array:
+        """Wrench (3,) of the fingers on the go, axes of W, about ``p_W`` (2,) in W; by default the grasp centre."""
+        g = self._grip
+        if p_W is None:
+            return np.array([g.fx, g.fy, g.tau])
+        x, y = np.asarray(p_W, float).tolist()
+        return np.array([g.fx, g.fy, g.torque_about(x, y)])
+
+    def table_load(self, x: float = 0.0, y: float = 0.0) -> tuple[float, float, float]:
+        """Wrench (fx, fy, τ) of all bodies on the ground about the point (x, y) in W, axes of W, in scalars."""
+        # contact forces between the bodies cancel in the sum, so what is left of all constraints is the ground's
+        r, q = self._reaction.tolist(), self._state_of_forces
+        fx, fy = r[0], r[1]
+        tau = r[2] + (q[0] - x) * fy - (q[1] - y) * fx
+        if self._has_eo:
+            gx, gy = r[3], r[4]
+            tau += r[5] + (q[3] - x) * gy - (q[4] - y) * gx
+            fx, fy = fx + gx, fy + gy
+        return -fx, -fy, -tau
+
+    def ground_wrench(self, p_W: ArrayLike = (0.0, 0.0)) -> Array:
+        """Total wrench (3,) of the go and the eo on the table about ``p_W`` (2,) in W, axes of W."""
+        x, y = np.asarray(p_W, float).tolist()
+        return np.array(self.table_load(x, y))
+
+    def contacts(self) -> tuple[ContactTruth, ...]:
+        """The contacts of the newest step, one per place: on the go or eo by the ground, on the eo by the go.
+
+        The normal points into the body acted on, t is the normal turned by −90°. ``slip+``: that body's contact point
+        sees the other move along +t relative to it, so friction pulls it along +t with f_t = +µ f_n; ``slip-`` the
+        other way; ``stick`` below `SLIP_SPEED`.
+        """
+        merged: list[list] = []
+        for i in range(self.data.ncon):
+            contact = self.data.contact[i]
+            if contact.efc_address < 0:
+                continue
+            on, by = self._owner[contact.geom[1]], self._owner[contact.geom[0]]
+            mujoco.mj_contactForce(self.model, self.data, i, self._force)
+            # MuJoCo's normal points from the first geom into the second, and the force acts on the second
+            axes = contact.frame.reshape(3, 3)
+            force, normal = (self._force[:3] @ axes)[[0, 2]], axes[0, [0, 2]]
+            if on == "ground" or (on, by) == ("go", "eo"):
+                on, by, force, normal = by, on, -force, -normal
+            point = contact.pos[[0, 2]]
+            for other in merged:
+                if other[:2] == [on, by] and np.abs(other[2] - point).max() < SAME_POINT and other[3] @ normal > 0.99:
+                    other[4] = other[4] + force
+                    break
+            else:
+                merged.append([on, by, point, normal / np.hypot(*normal), force])
+        out = [
+            ContactTruth(on, by, point, normal, force, self._mode(on, by, point, normal))
+            for on, by, point, normal, force in merged
+        ]
+        return tuple(sorted(out, key=lambda c: (c.on, c.by, float(c.point[0]), float(c.point[1]))))
+
+    def _mode(self, on: str, by: str, point: Array, normal: Array) -> str:
+        t = np.array([normal[1], -normal[0]])
+        along = float((self._velocity(by, point) - self._velocity(on, point)) @ t)
+        if abs(along) < SLIP_SPEED:
+            return "stick"
+        return "slip+" if along > 0 else "slip-"
+
+    def _velocity(self, body: str, point: Array) -> Array:
+        """Velocity (2,) in W of the point of ``body`` that is at ``point`` (2,) in W."""
+        if body == "ground":
+            return np.zeros(2)
+        first = 0 if body == "go" else 3
+        vx, vy, spin = self._qvel[first : first + 3].tolist()
+        x, y = self._state[first : first + 2]
+        return np.array([vx - spin * (point[1] - y), vy + spin * (point[0] - x)])

@@ -1,0 +1,217 @@
+"""A simulated tag camera: pictures of the tags by exact area coverage, and the detector's view of them.
+
+What leaves this room passed through pixels: the reading is what `drivers.tags.TagDetector` finds in the picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.config import TagCameraConfig
+from drivers.interfaces import Description, TagCamera
+from drivers.scene import TagMount
+from drivers.tags import TagDetector, tag_bitmap
+from mechanics.camera import CameraModel, point_in_world
+from mechanics.readings import Array, ImageReading, Stamp, TagReading
+from mechanics.se2 import transform
+
+_BLACK, _WHITE, _BACKGROUND = 20.0, 235.0, 128.0  # grey levels of matt print under even light
+
+
+class TagWorld(Protocol):
+    """What a tag camera needs of the simulated world."""
+
+    lockstep: bool
+
+    def now_ns(self) -> int:
+        """Present instant [ns]."""
+        ...
+
+    def visible_tags(self) -> list[tuple[TagMount, Array]]:
+        """Each tag with the pose X_W_body (3,) of the body that carries it."""
+        ...
+
+
+class TagRenderer:
+    """Draws tags as a camera sees them: each pixel is the mean over its square, exactly.
+
+    Every boundary between a black and a white cell is cut at the pixel grid and its signed area summed along the rows
+    (Green's theorem), so that an edge lies in the picture where it lies in the world, to the rounding of grey levels.
+    Under lens distortion a cell's edge is drawn as a chord of four.
+    """
+
+    def __init__(self, camera: CameraModel):
+        self.camera = camera
+        self._pieces = 4 if camera.distortion.any() else 1
+
+    def render(self, tags: Iterable[tuple[TagMount, Array]]) -> NDArray[np.uint8]:
+        """Picture (h, w) of tags on bodies at X_W_body (3,); a tag further in front hides what is behind it."""
+        grey = np.full((self.camera.height, self.camera.width), _BACKGROUND)
+        for mount, X_W_body in sorted(tags, key=lambda tag: tag[0].height):
+            self._draw(grey, mount, X_W_body)
+        return np.rint(grey).astype(np.uint8)
+
+    def _draw(self, grey: Array, mount: TagMount, X_W_body: Array) -> None:
+        start, end, level, cover = _boundaries(mount.id, self._pieces)
+        nodes = np.stack((start, end)) * (mount.size / 8)
+        p_W = transform(np.asarray(X_W_body, float), transform(np.asarray(mount.pose, float), nodes))
+        pixels = self.camera.project(point_in_world(p_W, mount.height))
+        if not np.isfinite(pixels).all():
+            return  # behind the camera
+        height, width = grey.shape
+        low = np.maximum(np.floor(pixels.min(axis=(0, 1)) + 0.5).astype(int), 0)
+        high = np.minimum(np.floor(pixels.max(axis=(0, 1)) + 0.5).astype(int) + 1, (width, height))
+        if (low >= high).any():
+            return
+        (x0, y0), (x1, y1) = low, high
+        shifted = pixels + 0.5 - low  # pixel (i, j) of the window covers [j, j + 1] × [i, i + 1]
+        value, alpha = _coverage(shifted[0], shifted[1], np.stack((level, cover)), y1 - y0, x1 - x0)
+        window = grey[y0:y1, x0:x1]
+        window *= 1 - alpha
+        window += value
+
+
+class SimTagCamera(TagCamera):
+    """The tag camera of the simulated station. ``noise`` is the standard deviation of a pixel in grey levels.
+
+    In lockstep a frame is exposed only when `capture` asks for one; in real time the world asks at ``config.rate``.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        config: TagCameraConfig,
+        world: TagWorld,
+        *,
+        noise: float = 0.0,
+        rng: np.random.Generator | None = None,
+    ):
+        super().__init__(name, buffer=256)
+        self._config, self._world = config, world
+        self.camera = CameraModel.looking_at(config.position, config.look_at, config.focal, config.width, config.height)
+        self._renderer = TagRenderer(self.camera)
+        self._noise, self._rng = noise, rng or np.random.default_rng(0)
+        self._detector: TagDetector | None = None
+        self._image: ImageReading | None = None
+        self._sequence = 0
+
+    def describe(self) -> Description:
+        """Its rate is 0 (on request only) in lockstep."""
+        return Description(
+            name=self.name,
+            kind="tag_camera",
+            model="simulated pinhole camera",
+            backend="sim",
+            serial=self._config.serial,
+            frame=self.name,
+            rate=0.0 if self._world.lockstep else self._config.rate,
+            range=(float(self._config.width), float(self._config.height)),
+            resolution=(1.0,),
+            extra={"camera": self.camera.as_dict(), "family": "tag36h11"},
+        )
+
+    def capture(self, timeout: float = 2.0) -> TagReading:
+        """Expose a frame at this instant and report the tags found in it."""
+        self._need_connection("capture")
+        assert self._detector is not None
+        picture = self._renderer.render(self._world.visible_tags())
+        if self._noise > 0:
+            noisy = picture + self._rng.normal(0.0, self._noise, picture.shape)
+            picture = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        now = self._world.now_ns()
+        stamp = Stamp(now, now, self._sequence, self.name)
+        self._sequence += 1
+        self._image = ImageReading(stamp, picture, "mono8")
+        reading = TagReading(stamp, self._detector.detect(picture), self._detector.family)
+        self._push(reading)
+        return reading
+
+    def image(self) -> ImageReading | None:
+        """The picture (mono8) behind the newest `capture`."""
+        return self._image
+
+    def restart(self, rng: np.random.Generator | None = None) -> None:
+        """Begin a new epoch after the world was reset, with ``rng``'s noise: frames count from 0, old ones are gone."""
+        self._rng = rng or self._rng
+        self._forget()
+        self._sequence = 0
+        self._image = None
+
+    def _open(self, timeout: float) -> None:
+        self._detector = TagDetector()
+
+    def _shut(self) -> None:
+        if self._detector is not None:
+            self._detector.close()
+            self._detector = None
+
+
+@lru_cache(maxsize=64)
+def _boundaries(id: int, pieces: int) -> tuple[Array, Array, Array, Array]:
+    """Edges between cells that differ: start and end (n, 2) in cells from the tag's centre, y up.
+
+    With each goes by how much the grey level and the cover rise from its left to its right when it points down the
+    picture.
+    """
+    cells = tag_bitmap(id)
+    n = len(cells)
+    level = np.pad(np.where(cells > 127, _WHITE, _BLACK), 1)
+    cover = np.pad(np.ones((n, n)), 1)
+    start, end, jumps = [], [], []
+    for row, column, down in ((r, c, d) for r in range(n + 1) for c in range(n + 1) for d in (True, False)):
+        if down and row < n:
+            right, left = (row + 1, column + 1), (row + 1, column)
+            to = (row + 1, column)
+        elif not down and column < n:
+            right, left = (row, column + 1), (row + 1, column + 1)
+            to = (row, column + 1)
+        else:
+            continue
+        jump = (level[right] - level[left], cover[right] - cover[left])
+        if any(jump):
+            start.append((column - n / 2, n / 2 - row))
+            end.append((to[1] - n / 2, n / 2 - to[0]))
+            jumps.append(jump)
+    first, last, rise = np.array(start), np.array(end), np.array(jumps)
+    cuts = np.linspace(0, 1, pieces + 1)[:, None, None]
+    nodes = first + cuts * (last - first)
+    arrays = (nodes[:-1].reshape(-1, 2), nodes[1:].reshape(-1, 2), *np.tile(rise, (pieces, 1)).T)
+    for array in arrays:
+        array.setflags(write=False)
+    return arrays
+
+
+def _coverage(start: Array, end: Array, jumps: Array, height: int, width: int) -> Array:
+    """Pictures (m, height, width) whose values rise by ``jumps`` (m, n) across directed segments (n, 2) → (n, 2).
+
+    Each pixel [j, j + 1] × [i, i + 1] is the exact mean over its square.
+    """
+    delta = end - start
+    cuts = [np.zeros((len(start), 1)), np.ones((len(start), 1))]
+    for axis in (0, 1):
+        low = np.minimum(start[:, axis], end[:, axis])
+        lines = np.floor(low)[:, None] + 1 + np.arange(int(np.ceil(np.abs(delta[:, axis]).max())) + 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (lines - start[:, axis, None]) / delta[:, axis, None]
+        cuts.append(np.clip(np.nan_to_num(t, nan=1.0, posinf=1.0, neginf=1.0), 0.0, 1.0))
+    t = np.sort(np.concatenate(cuts, axis=1), axis=1)
+    at = 0.5 * (t[:, 1:] + t[:, :-1])
+    drop = (t[:, 1:] - t[:, :-1]) * delta[:, 1, None]  # signed height of each piece, which lies within one pixel
+    x = start[:, 0, None] + at * delta[:, 0, None]
+    row = np.floor(start[:, 1, None] + at * delta[:, 1, None]).astype(np.intp)
+    x = np.clip(x, 0.0, width)  # what lies left of the window still covers all of its row, what lies right nothing
+    column = np.minimum(x.astype(np.intp), width)
+    right = drop * (x - column)
+    keep = (row >= 0) & (row < height) & (drop != 0)
+    index = (row * (width + 2) + column)[keep]
+    out = np.empty((len(jumps), height, width))
+    for picture, jump in zip(out, jumps, strict=True):
+        here, beyond = ((jump[:, None] * part)[keep] for part in (drop - right, right))
+        total = np.bincount(index, here, height * (width + 2)) + np.bincount(index + 1, beyond, height * (width + 2))
+        picture[:] = np.cumsum(total.reshape(height, width + 2), axis=1)[:, :width]
+    return out

@@ -1,0 +1,344 @@
+"""Opens a station: joins the one that is running at its endpoint, or starts the simulated one."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Self, cast
+from urllib.parse import urlsplit
+
+from drivers.config import StationConfig
+from drivers.errors import DriverError, NotConnected
+from drivers.interfaces import Arm, Device, ForceTorqueSensor, Gripper, TagCamera
+from drivers.wire import topics
+from drivers.wire.bus import Bus, Watch
+from drivers.wire.client import REMOTES, RemoteSensor
+from drivers.wire.clock import RemoteClock, RemoteSimulation
+from drivers.wire.link import Link
+from drivers.wire.log import LogWriter
+
+HOST_START = 20.0
+"""How long a simulated host may take to start [s]; it takes about one."""
+
+_HERE = str(Path(__file__).resolve().parent.parent)
+_PROBE = 1.0
+_HOST_STOP = 3.0
+_PROTOCOL = 1
+
+log = logging.getLogger(__name__)
+
+
+class Devices(Mapping[str, Device]):
+    """The open devices of a station by name; also by role, where the station has exactly one of a kind.
+
+    ``simulation`` is None for a station without a world, ``host`` unless this process started it.
+    """
+
+    def __init__(
+        self,
+        config: StationConfig,
+        bus: Bus,
+        devices: dict[str, RemoteSensor],
+        clock: RemoteClock,
+        simulation: RemoteSimulation | None,
+        host: HostProcess | None,
+        link: Link,
+        watch: Watch,
+    ):
+        self.config, self.bus, self.clock, self.simulation, self.host = config, bus, clock, simulation, host
+        self._devices, self._link, self._watch = devices, link, watch
+
+    def __getitem__(self, name: str) -> Device:
+        return self._devices[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._devices)
+
+    def __len__(self) -> int:
+        return len(self._devices)
+
+    @property
+    def arm(self) -> Arm:
+        """The arm."""
+        return cast("Arm", self._only("arm"))
+
+    @property
+    def gripper(self) -> Gripper:
+        """The gripper."""
+        return cast("Gripper", self._only("gripper"))
+
+    @property
+    def camera(self) -> TagCamera:
+        """The tag camera."""
+        return cast("TagCamera", self._only("tag_camera"))
+
+    def force_torque(self, mount: str) -> ForceTorqueSensor:
+        """The force/torque sensor that is mounted at ``wrist`` or ``table``."""
+        return cast("ForceTorqueSensor", self._only("force_torque", mount))
+
+    def _only(self, kind: str, mount: str | None = None) -> Device:
+        wanted = kind if mount is None else f"{kind} at the {mount}"
+        found = [
+            name
+            for name, device in self.config.devices.items()
+            if device.kind == kind and (mount is None or getattr(device, "mount", None) == mount)
+        ]
+        if len(found) != 1:
+            got = f"the station has {len(found)} of them" if found else "the station has none"
+            raise NotConnected(self.config.name, f"find its {wanted}", got, "Check the devices of the station file")
+        return self._devices[found[0]]
+
+    def attach(self, writer: LogWriter) -> None:
+        """Log every stream of the station but those that its file omits. When it returns, nothing more is missed."""
+        prefix = f"{self.config.name}/"
+        omit = self.config.log.omit
+        wanted = {
+            topic: type_name
+            for topic, type_name in topics.streams(self.config).items()
+            if topic not in omit and topic.removeprefix(prefix) not in omit
+        }
+        writer.attach(self.bus, wanted, lockstep=self.clock.lockstep)
+        # the answer comes after the host has heard of the subscriptions
+        self._link.ask(topics.WORLD, "describe", watch=self._watch)
+
+    def log(self, path: Path | str) -> LogWriter:
+        """A new log with the station attached; close it."""
+        writer = LogWriter(path, flush=self.config.log.flush)
+        try:
+            self.attach(writer)
+        except BaseException:
+            writer.close()
+            raise
+        return writer
+
+
+class Station:
+    """A station by its file. `connect` opens it as a context; a station can be opened again after it was closed."""
+
+    def __init__(self, config: StationConfig):
+        self.config = config
+
+    def connect(self) -> Connection:
+        """The way in: ``with Station(config).connect() as devices:``."""
+        return Connection(self.config)
+
+
+class Connection:
+    """An open station: host process if it had to be started, bus, devices; closed in the reverse order."""
+
+    def __init__(self, config: StationConfig):
+        self.config = config
+        self.host: HostProcess | None = None
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Devices:
+        with ExitStack() as stack:
+            devices = self._open(stack)
+            self._stack = stack.pop_all()
+        return devices
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    def _open(self, stack: ExitStack) -> Devices:
+        config = self.config
+        endpoint = config.bus.endpoint
+        if not listening(endpoint):
+            if config.world is None or any(device.backend != "sim" for device in config.devices.values()):
+                raise NotConnected(
+                    config.name,
+                    f"connect to {endpoint}",
+                    "nothing listens there",
+                    "Start the station with `extrinsic serve STATION`, or correct bus.endpoint",
+                )
+            self.host = stack.enter_context(HostProcess(config))
+        bus = stack.enter_context(Bus(endpoint, timeout=config.bus.timeout, shared_memory=False))
+        watch = bus.watch(topics.alive(config.name, topics.WORLD))
+        stack.callback(self._abandon, watch)
+        if not watch.seen(config.bus.timeout):
+            raise NotConnected(
+                config.name,
+                f"connect to {endpoint}",
+                f"whatever listens there does not serve station '{config.name}'",
+                "Another station or program has the port; change bus.endpoint or end it",
+            )
+        link = Link(bus, config.name)
+        reply = link.ask(topics.WORLD, "describe", watch=watch)
+        _agree(config, json.loads(reply.text))
+        link.now_ns = reply.now_ns
+        lockstep = config.world is not None and config.world.clock == "lockstep"
+        devices = {name: REMOTES[device.kind](name, link, lockstep) for name, device in config.devices.items()}
+        failures: list[DriverError] = []
+        for device in devices.values():
+            try:
+                device.connect(config.bus.timeout)
+                stack.callback(device.close)
+            except DriverError as error:
+                failures.append(error)
+        if failures:
+            raise NotConnected(
+                config.name,
+                "open its devices",
+                f"{len(failures)} of {len(devices)} failed",
+                "Mend each of these:",
+                children=tuple(failures),
+            )
+        simulation = None if config.world is None else RemoteSimulation(link, watch, list(devices.values()))
+        clock = RemoteClock(link, watch, lockstep)
+        return Devices(config, bus, devices, clock, simulation, self.host, link, watch)
+
+    def _abandon(self, watch: Watch) -> None:
+        """Kill a host that no longer answers, before the bus waits for it to close in order."""
+        if watch.gone and self.host is not None:
+            self.host.kill()
+
+
+class HostProcess:
+    """The simulated station as a child process; started by `__enter__`, ended and reaped by `close`.
+
+    It is in a process group of its own, so that an interrupt from the keyboard reaches only this process, which then
+    closes in order. It ends by itself when this process dies.
+    """
+
+    def __init__(self, config: StationConfig):
+        self._process: subprocess.Popen[bytes] | None = None
+        self._config = config
+        self._said: deque[str] = deque(maxlen=50)
+        self._listener: threading.Thread | None = None
+
+    @property
+    def pid(self) -> int:
+        """The process id. Raises NotConnected when it is not running."""
+        if self._process is None:
+            raise NotConnected(self._config.name, "name its host's process", "there is none", "")
+        return self._process.pid
+
+    def __enter__(self) -> Self:
+        order = {
+            "config": self._config.model_dump(mode="json"),
+            # the kernel's signal follows the *thread* that starts the host; one that may end first must not set it
+            "bound": threading.current_thread() is threading.main_thread(),
+        }
+        self._process = process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "drivers.sim.host"],  # -P: a folder that happens to lie here is no package
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (_HERE, os.environ.get("PYTHONPATH"))))},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
+        try:
+            assert process.stdin is not None and process.stdout is not None and process.stderr is not None
+            self._listener = threading.Thread(target=self._hear, args=(process.stderr,), name="host", daemon=True)
+            self._listener.start()
+            try:
+                process.stdin.write(json.dumps(order).encode() + b"\n")
+                process.stdin.flush()
+            except OSError:
+                pass  # it ended at once; its last words tell why
+            self._await(process.stdout)
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _await(self, stdout: IO[bytes]) -> None:
+        asked, remedy = "start its simulated host", "Run `extrinsic serve STATION` to see what it says"
+        if not select.select([stdout], [], [], HOST_START)[0]:
+            raise NotConnected(self._config.name, asked, f"not ready within {HOST_START:g} s", remedy)
+        line = stdout.readline()
+        try:
+            said = json.loads(line)
+        except ValueError:
+            said = {"error": "it ended before it was ready. " + self.last_words()}
+        if "ready" not in said:
+            child = NotConnected(
+                said.get("device", "host"), said.get("asked", "serve"), said.get("error", "?"), said.get("remedy", "")
+            )
+            raise NotConnected(self._config.name, asked, "it failed", remedy, children=(child,))
+
+    def kill(self) -> None:
+        """End it at once."""
+        if self._process is not None:
+            self._process.kill()
+
+    def last_words(self) -> str:
+        """The newest lines that the host wrote to its standard error."""
+        if self._listener is not None and self._process is not None and self._process.poll() is not None:
+            self._listener.join(timeout=1.0)
+        return "\n".join(self._said)
+
+    def _hear(self, stderr: IO[bytes]) -> None:
+        for line in stderr:
+            text = line.decode(errors="replace").rstrip()
+            self._said.append(text)
+            log.warning("host: %s", text)
+
+    def close(self) -> None:
+        """Ask the host to end, insist, and reap it; idempotent."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(_HOST_STOP)
+            except subprocess.TimeoutExpired:
+                log.warning("the simulated host did not end within %g s and was killed", _HOST_STOP)
+                process.kill()
+                process.wait()
+        if self._listener is not None:
+            self._listener.join(timeout=1.0)
+        for pipe in (process.stdin, process.stdout, process.stderr):
+            if pipe is not None:
+                try:
+                    pipe.close()
+                except OSError:
+                    continue  # the other end is gone
+
+
+def listening(endpoint: str) -> bool:
+    """Whether anything accepts connections at an endpoint like ``tcp/127.0.0.1:7447``."""
+    address = urlsplit("//" + endpoint.split("/", 1)[1])
+    try:
+        with socket.create_connection((address.hostname or "", address.port or 0), timeout=_PROBE):
+            return True
+    except OSError:
+        return False
+
+
+def _agree(config: StationConfig, said: dict) -> None:
+    """Refuse a running host of another version or with another idea of the station. Raises NotConnected."""
+    asked = f"join the host at {config.bus.endpoint}"
+    if said.get("protocol") != _PROTOCOL:
+        raise NotConnected(
+            config.name, asked, f"it speaks protocol {said.get('protocol')}, not {_PROTOCOL}", "Restart it"
+        )
+    mine, theirs = config.model_dump(mode="json"), said["config"]
+    differing = [key for key in ("name", "world", "devices", "table_tags") if mine.get(key) != theirs.get(key)]
+    if differing:
+        raise NotConnected(
+            config.name,
+            asked,
+            f"it was started from a station file with another {', '.join(differing)}",
+            "End that host, or use its station file",
+        )

@@ -1,0 +1,84 @@
+"""The station's time and its simulated world, seen from another process."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from typing import cast
+
+from drivers.errors import DeviceFault
+from drivers.wire import messages, topics
+from drivers.wire.bus import Watch
+from drivers.wire.client import RemoteSensor
+from drivers.wire.codec import decode_reading
+from drivers.wire.link import Link
+from mechanics.readings import TruthReading
+
+_PIECE_NS = 250_000_000  # station time per request: a long sleep stays interruptible, and each reply comes in time
+
+
+class RemoteClock:
+    """The station's `Clock`. In lockstep one query advances the world; otherwise time passes by itself."""
+
+    def __init__(self, link: Link, watch: Watch, lockstep: bool):
+        self.lockstep = lockstep
+        self._link, self._watch = link, watch
+
+    def now_ns(self) -> int:
+        """As `Clock.now_ns`."""
+        return self._link.now_ns if self.lockstep else time.time_ns()
+
+    def sleep(self, seconds: float) -> None:
+        """As `Clock.sleep`. In lockstep nothing published meanwhile is missing afterwards: here and in the log."""
+        if not 0.0 <= seconds < 1e6:
+            raise ValueError(f"a sleep of {seconds} s; expected a finite time that is not negative")
+        if not self.lockstep:
+            if self._watch.wait(seconds):
+                raise DeviceFault(topics.WORLD, "sleep", "the station has died", "Start the station again")
+            return
+        left = round(seconds * 1e9)
+        while left > 0:
+            piece = min(left, _PIECE_NS)
+            left -= piece
+            whole, rest = divmod(piece, messages.NANOSECONDS)
+            payload = messages.encode(messages.message(messages.DURATION, sec=whole, nanosec=rest))
+            reply = self._link.ask(topics.WORLD, "advance", payload, watch=self._watch)
+            self._link.now_ns = reply.now_ns
+
+
+class RemoteSimulation:
+    """The station's `Simulation`."""
+
+    def __init__(self, link: Link, watch: Watch, sensors: Sequence[RemoteSensor]):
+        self._link, self._watch, self._sensors = link, watch, tuple(sensors)
+
+    def reset(self, seed: int, scene: dict, world: dict | None = None) -> None:
+        """As `Simulation.reset`; ``world`` (a `drivers.config.WorldConfig` as a dict) replaces the present one's.
+
+        Raises CommandRefused while another session commands the arm, and for a scene that cannot be.
+        """
+        for subscription in self._link.bus.subscriptions():
+            subscription.rewind()
+        for sensor in self._sensors:
+            sensor.forget()
+        payload = messages.encode(
+            messages.message(
+                messages.RESET,
+                seed=seed,
+                scene=json.dumps(scene),
+                world="" if world is None else json.dumps(world),
+                session=self._link.bus.zid,
+            )
+        )
+        reply = self._link.ask(topics.WORLD, "reset", payload, watch=self._watch)
+        self._link.now_ns = reply.now_ns
+
+    def truth(self) -> TruthReading:
+        """As `Simulation.truth`."""
+        reply = self._link.ask(topics.WORLD, "truth", watch=self._watch)
+        return cast("TruthReading", decode_reading(reply.type, reply.data.tobytes(), 0))
+
+    def counts(self) -> dict[str, int]:
+        """As `Simulation.counts`: messages put on the bus; a stream that nobody hears is not put there."""
+        return json.loads(self._link.ask(topics.WORLD, "counts", watch=self._watch).text)

@@ -1,0 +1,91 @@
+"""What a run writes down of itself, to messages and back: the records of `mechanics.records`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drivers.errors import ProtocolError
+from drivers.wire import messages
+from mechanics.records import EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
+
+Record = WaypointRecord | TrialRecord | PhaseRecord | EventRecord
+
+STREAMS: dict[type, tuple[str, str]] = {
+    WaypointRecord: ("run/waypoint", "extrinsic_msgs/msg/WaypointRecord"),
+    TrialRecord: ("run/trial", "extrinsic_msgs/msg/TrialRecord"),
+    PhaseRecord: ("run/phase", "extrinsic_msgs/msg/PhaseRecord"),
+    EventRecord: ("run/event", "extrinsic_msgs/msg/EventRecord"),
+}
+"""Topic and type of each kind of record."""
+
+_KINDS = {type_name: kind for kind, (_, type_name) in STREAMS.items()}
+_STATE = "extrinsic_msgs/msg/PlanarState"
+
+
+def encode_record(record: Record) -> bytes:
+    """The record as CDR of its type in `STREAMS`."""
+    header = messages.header(record.capture_ns, "world")
+    if isinstance(record, WaypointRecord):
+        truth = record.truth
+        fields: dict[str, Any] = {
+            "trial": record.trial,
+            "step": record.step,
+            "planned": _state(record.planned),
+            "commanded": _doubles(record.commanded),
+            "measured": _state(record.measured),
+            "has_truth": truth is not None,
+            "truth": _state(record.measured if truth is None else truth),
+        }
+    else:
+        fields = {name: getattr(record, name) for name in record.__dataclass_fields__ if name != "capture_ns"}
+    return messages.encode(messages.message(STREAMS[type(record)][1], header=header, **fields))
+
+
+def decode_record(type_name: str, payload: bytes) -> Record:
+    """The record in a payload. Raises ProtocolError."""
+    try:
+        kind = _KINDS[type_name]
+    except KeyError:
+        raise ProtocolError("wire", f"read {type_name}", "no record travels as this type", "") from None
+    value = messages.decode(payload, type_name)
+    capture_ns = messages.stamp_ns(value.header.stamp)
+    if kind is WaypointRecord:
+        return WaypointRecord(
+            capture_ns,
+            value.trial,
+            value.step,
+            _planar(value.planned),
+            value.commanded.copy(),
+            _planar(value.measured),
+            _planar(value.truth) if value.has_truth else None,
+        )
+    names = [name for name in kind.__dataclass_fields__ if name != "capture_ns"]
+    return kind(capture_ns, *(getattr(value, name) for name in names))
+
+
+def _state(state: PlanarState) -> Any:
+    nothing = np.zeros(3)
+    return messages.message(
+        _STATE,
+        ee=_doubles(state.ee),
+        has_go=state.go is not None,
+        go=nothing if state.go is None else _doubles(state.go),
+        has_eo=state.eo is not None,
+        eo=nothing if state.eo is None else _doubles(state.eo),
+        wrench=_doubles(state.wrench),
+    )
+
+
+def _planar(value: Any) -> PlanarState:
+    return PlanarState(
+        value.ee.copy(),
+        value.go.copy() if value.has_go else None,
+        value.eo.copy() if value.has_eo else None,
+        value.wrench.copy(),
+    )
+
+
+def _doubles(values: Any) -> Any:
+    return np.ascontiguousarray(values, dtype=np.float64)

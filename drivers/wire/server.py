@@ -1,0 +1,252 @@
+"""Puts a device of this process on the bus: its readings as streams, its commands as queries with a typed reply."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, DriverError, NotConnected, ProtocolError
+from drivers.interfaces import Device, ForceTorqueSensor, Gripper, ImagingSensor, Sensor, TagCamera
+from drivers.wire import messages, topics
+from drivers.wire.bus import Bus, Publisher, Query
+from drivers.wire.codec import Reading, encode_compressed, encode_reading
+from mechanics.readings import ImageReading
+
+log = logging.getLogger(__name__)
+
+OUTCOMES: tuple[tuple[int, type[DriverError]], ...] = (
+    (1, CommandRefused),
+    (2, DeviceFault),
+    (3, DeviceTimeout),
+    (4, NotConnected),
+    (5, ProtocolError),
+)
+"""Reply.outcome of each error; 0 is success."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a verb returns: JSON ``text``, or a reading as ``data`` of message type ``type``."""
+
+    text: str = ""
+    type: str = ""
+    data: bytes = b""
+
+
+Work = Callable[[], None]
+Run = Callable[[Work, bool], None]
+Verb = Callable[[bytes], Answer | None]
+
+
+class Lane:
+    """The default way to run work: at once, in the thread that brings it, one piece at a time.
+
+    Urgent work (stop, hold) does not wait for its turn.
+    """
+
+    def __init__(self) -> None:
+        self._turn = threading.Lock()
+
+    def __call__(self, work: Work, urgent: bool) -> None:
+        """Run ``work`` and return when it is done."""
+        if urgent:
+            work()
+        else:
+            with self._turn:
+                work()
+
+
+class Desk:
+    """What the servers of one process share: the bus, the thread that owns the devices, the clock, the streams.
+
+    ``run(work, urgent)`` has ``work`` executed by the owner of the devices. ``shift_ns()`` is added to every capture
+    time. With ``lossless`` a slow reader holds up even images, as it may in lockstep, where time stands still for it.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        station: str,
+        *,
+        run: Run | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        shift_ns: Callable[[], int] = lambda: 0,
+        lossless: bool = False,
+    ):
+        self.bus, self.station, self.now_ns, self.shift_ns = bus, station, now_ns, shift_ns
+        self.run: Run = run or Lane()
+        self._keep_all = lossless
+        self.publishers: list[Publisher] = []
+        self._lossless: list[Publisher] = []
+
+    def publisher(self, device: str, stream: str, type_name: str) -> Publisher:
+        """Announce a stream. Images may be dropped on their way to a slow viewer, everything else arrives."""
+        lossy = not self._keep_all and type_name in (messages.IMAGE, messages.COMPRESSED_IMAGE)
+        publisher = self.bus.publisher(topics.key(self.station, device, stream), type_name, lossy)
+        self.publishers.append(publisher)
+        if not lossy:
+            self._lossless.append(publisher)
+        return publisher
+
+    def serve(
+        self, device: str, verb: str, work: Verb, *, urgent: bool = False, direct: bool = False
+    ) -> Callable[[], None]:
+        """Answer a verb by ``work``, in the owner's thread, or in the bus's (``direct``); returns the way to stop."""
+
+        def handle(query: Query) -> None:
+            def answer() -> None:
+                query.reply(self._reply(device, verb, lambda: work(query.payload), [] if direct else self._lossless))
+
+            if direct:
+                answer()
+            else:
+                self.run(answer, urgent)
+
+        return self.bus.serve(topics.key(self.station, device, verb), handle)
+
+    def counts(self) -> dict[str, int]:
+        """Messages published per topic since `restart`."""
+        return {publisher.topic: publisher.count for publisher in self.publishers}
+
+    def restart(self) -> None:
+        """Count anew."""
+        for publisher in self.publishers:
+            publisher.count = 0
+
+    def _reply(self, device: str, verb: str, work: Callable[[], Answer | None], streams: list[Publisher]) -> bytes:
+        """Run a verb; whatever happens, there is a reply, for an empty one looks like death."""
+        counts = [publisher.count for publisher in streams]
+        outcome, error, done = 0, DriverError("", "", "", ""), Answer()
+        try:
+            done = work() or Answer()
+        except DriverError as problem:
+            error = problem
+            outcome = next(number for number, kind in OUTCOMES if isinstance(problem, kind))
+        except Exception as problem:
+            log.exception("%s: %s failed", device, verb)
+            error = DeviceFault(device, verb, f"{type(problem).__name__}: {problem}", "This is a defect; report it")
+            outcome = 2
+        published = [
+            messages.message("extrinsic_msgs/msg/Progress", topic=publisher.topic, sequence=publisher.newest)
+            for publisher, before in zip(streams, counts, strict=False)
+            if publisher.count > before
+        ]
+        return messages.encode(
+            messages.message(
+                messages.REPLY,
+                outcome=outcome,
+                device=error.device,
+                asked=error.asked,
+                got=error.reason if isinstance(error, CommandRefused) else error.got,
+                remedy=error.remedy,
+                recoverable=isinstance(error, DeviceFault) and error.recoverable,
+                now_ns=self.now_ns(),
+                text=done.text,
+                type=done.type,
+                data=np.frombuffer(done.data, np.uint8),
+                published=published,
+            )
+        )
+
+
+class DeviceServer:
+    """A device on the bus: a context manager that opens the device and closes it again."""
+
+    def __init__(self, desk: Desk, device: Device):
+        self.desk, self.device = desk, device
+        self._stops: list[Callable[[], None]] = []
+        self._streams: dict[str, Publisher] = {}
+        self._token: Any = None
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def open(self) -> None:
+        """Connect the device, announce its streams, answer its verbs; then say that it is alive."""
+        device, description = self.device, self.device.describe()
+        device.connect()
+        for stream, type_name in topics.STREAMS[description.kind].items():
+            self._streams[stream] = self.desk.publisher(device.name, stream, type_name)
+        if isinstance(device, Sensor):
+            self._stops.append(device.listen(self._publish))
+        self._serve("describe", lambda _: Answer(json.dumps(asdict(self.device.describe()))), direct=True)
+        self._verbs()
+        self._token = self.desk.bus.token(topics.alive(self.desk.station, device.name))
+
+    def close(self) -> None:
+        """Withdraw from the bus and close the device, which holds an arm; idempotent."""
+        stops, self._stops = self._stops, []
+        for stop in reversed(stops):
+            stop()
+        if self._token is not None:
+            self._token.undeclare()
+            self._token = None
+        for publisher in self._streams.values():
+            publisher.close()
+        self._streams = {}
+        self.device.close()
+
+    def _serve(self, verb: str, work: Verb, *, urgent: bool = False, direct: bool = False) -> None:
+        self._stops.append(self.desk.serve(self.device.name, verb, work, urgent=urgent, direct=direct))
+
+    def _verbs(self) -> None:
+        device = self.device
+        if isinstance(device, ForceTorqueSensor):
+            self._serve("tare", lambda _: device.tare())
+        if isinstance(device, Gripper):
+            self._serve("grasp", lambda payload: device.grasp(messages.decode(payload, messages.FLOAT).data))
+            self._serve("release", lambda _: device.release())
+        if isinstance(device, ImagingSensor):
+            self._serve("capture", lambda _: self.capture())
+        if isinstance(device, TagCamera):
+            self._serve("image", lambda _: _picture(device.image()))
+
+    def capture_if_wanted(self) -> None:
+        """Take a frame if somebody listens: the stream of a camera that has no thread of its own."""
+        if any(publisher.matched for publisher in self._streams.values()):
+            self.capture()
+
+    def capture(self) -> None:
+        """Take a frame; its reading and its picture go out as streams."""
+        device = self.device
+        assert isinstance(device, ImagingSensor)
+        device.capture()
+        if isinstance(device, TagCamera) and self._streams["image"].matched:
+            picture = device.image()
+            if picture is not None:
+                self._put_picture(picture)
+
+    def _publish(self, reading: Reading) -> None:
+        if isinstance(reading, ImageReading):
+            self._put_picture(reading)
+            return
+        publisher = next(iter(self._streams.values()), None)
+        if publisher is not None and publisher.matched:
+            shift, stamp = self.desk.shift_ns(), reading.stamp
+            publisher.put(encode_reading(reading, shift), stamp.sequence, stamp.capture_ns + shift, int(stamp.status))
+
+    def _put_picture(self, picture: ImageReading) -> None:
+        publisher = self._streams["image"]
+        if publisher.matched:
+            shift, stamp = self.desk.shift_ns(), picture.stamp
+            publisher.put(
+                encode_compressed(picture, shift), stamp.sequence, stamp.capture_ns + shift, int(stamp.status)
+            )
+
+
+def _picture(picture: ImageReading | None) -> Answer | None:
+    return None if picture is None else Answer(type=messages.IMAGE, data=encode_reading(picture))

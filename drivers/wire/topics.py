@@ -1,0 +1,61 @@
+"""Key expressions: ``<station>/<device>/<stream or verb>``. Nothing outside `drivers` knows a key.
+
+A stream is a publication, a verb a query. The key of a stream is its ROS 2 topic name without the leading slash.
+"""
+
+from __future__ import annotations
+
+from drivers.config import StationConfig
+from drivers.wire import messages
+
+WORLD = "world"
+"""The pseudo-device that stands for the station itself: its description, its clock and, in simulation, its truth."""
+
+STREAMS: dict[str, dict[str, str]] = {
+    "arm": {"pose": messages.POSE, "target": messages.TARGET},
+    "gripper": {"state": messages.GRIPPER},
+    "force_torque": {"wrench": messages.WRENCH},
+    "tag_camera": {"detections": messages.DETECTIONS, "image": messages.COMPRESSED_IMAGE},
+    "tactile": {"image": messages.COMPRESSED_IMAGE},
+    WORLD: {"truth": messages.TRUTH},
+}
+"""Streams by kind of device, with their types; the first carries the device's readings."""
+
+
+def key(station: str, device: str, part: str) -> str:
+    """The key of a device's stream or verb."""
+    return f"{station}/{device}/{part}"
+
+
+def alive(station: str, device: str) -> str:
+    """The liveliness token that a device's server holds."""
+    return f"{station}/{device}/alive"
+
+
+def lease(station: str, device: str, holder: str) -> str:
+    """The liveliness token that an arm's commander holds; ``holder`` may be ``*``."""
+    return f"{station}/{device}/holder/{holder}"
+
+
+def holder_of(token: str) -> str:
+    """The holder that a `lease` token names."""
+    return token.rsplit("/", 1)[1]
+
+
+def streams(config: StationConfig) -> dict[str, str]:
+    """Every stream of a station with its type."""
+    devices = {name: str(device.kind) for name, device in config.devices.items()}
+    if config.world is not None:
+        devices[WORLD] = WORLD
+    return {
+        key(config.name, name, stream): type_name
+        for name, kind in devices.items()
+        for stream, type_name in STREAMS[kind].items()
+    }
+
+
+def discovery(zid: str, topic: str, type_name: str) -> str:
+    """The liveliness token by which zenoh's ROS 2 bridge announces a publication (reliable, volatile, keep last)."""
+    hidden = topic.replace("/", "§")
+    hidden_type = type_name.replace("/", "§")
+    return f"@/{zid}/@ros2_lv/MP/{hidden}/{hidden_type}/:1::0,10"

@@ -1,0 +1,86 @@
+"""The dry run: what an experiment would do, and whether its tasks exist, without touching a device."""
+
+from __future__ import annotations
+
+from drivers.config import ForceTorqueConfig
+from experiments.files import Resolved
+from experiments.schema import PlanStage
+from experiments.setup import task
+from mechanics.yaml_input import InputError, Problem
+from planning.task import Task
+
+
+def check(resolved: Resolved) -> list[str]:
+    """What would run, in lines for a person. Raises InputError, and InfeasiblePlan where a task says so itself."""
+    problems = _device_problems(resolved)
+    if problems:
+        raise InputError(problems)
+    made = tasks(resolved)
+    experiment, station = resolved.experiment, resolved.station
+    held = resolved.grasped
+    lines = [
+        f"experiment {experiment.name}, seed {experiment.seed}",
+        f"station {station.name}: {', '.join(station.devices)}"
+        + (f"; world {station.world.profile}, {station.world.clock}" if station.world else ""),
+        f"sensor {resolved.sensor.name}; grasped object {held.name}, {held.mass:g} kg"
+        + (
+            f"; extrinsic object {resolved.extrinsic.name}, {resolved.extrinsic.mass:g} kg"
+            if resolved.extrinsic
+            else ""
+        ),
+        "friction " + ", ".join(f"{pair} {mu:g}" for pair, mu in resolved.friction.items()),
+    ]
+    trials = 0
+    for number, stage in enumerate(experiment.stages, 1):
+        if isinstance(stage, PlanStage):
+            lines.append(f"stage {number}: plan {stage.name}: {stage.skill}, {len(made[stage.name].go)} steps")
+        else:
+            trials += stage.trials * len(stage.controllers)
+            count = f"{stage.trials} trial{'s' if stage.trials > 1 else ''} each"
+            lines.append(f"stage {number}: execute {stage.plan}: {', '.join(stage.controllers)}, {count}")
+    lines.append(f"{trials} trial{'' if trials == 1 else 's'} in all; nothing was started")
+    return lines
+
+
+def tasks(resolved: Resolved) -> dict[str, Task]:
+    """The planning task of each plan stage by name.
+
+    Raises InputError at the parameter that the geometry does not allow.
+    """
+    made: dict[str, Task] = {}
+    for i, stage in enumerate(resolved.experiment.stages):
+        if not isinstance(stage, PlanStage):
+            continue
+        try:
+            made[stage.name] = task(resolved, stage)
+        except ValueError as e:
+            raise InputError([_task_problem(resolved, i, stage, str(e))]) from None
+    return made
+
+
+def _task_problem(resolved: Resolved, i: int, stage: PlanStage, text: str) -> Problem:
+    """The skill's complaint, at the parameter that it names first (``angle_deg: …``)."""
+    parameter, colon, rest = text.partition(": ")
+    path = ("stages", i, "parameters")
+    if colon and parameter in stage.parameters:
+        path, text = (*path, parameter), rest
+    expected = f"parameters that {stage.skill} can do with {resolved.grasped.name}"
+    return resolved.experiment_document.problem(path, text, expected)
+
+
+def _device_problems(resolved: Resolved) -> list[Problem]:
+    """A run commands an arm, and sees through a wrist force/torque sensor and a camera."""
+    station, document = resolved.station, resolved.station_document
+    problems = [
+        document.problem(("devices",), f"the station has no {kind}", "a device of that kind")
+        for kind in ("arm", "tag_camera")
+        if not any(device.kind == kind for device in station.devices.values())
+    ]
+    if not any(isinstance(d, ForceTorqueConfig) and d.mount == "wrist" for d in station.devices.values()):
+        problems.append(document.problem(("devices",), "the station has no force_torque on the wrist", "mount: wrist"))
+    if not station.table_tags:
+        problems.append(document.problem(("table_tags",), "the table has no tags", "at least one tag"))
+    if resolved.grasped.tag is None:
+        wrong = f"{resolved.grasped.name} has no tag: the camera could not see it"
+        problems.append(resolved.experiment_document.problem(("grasped_object",), wrong, "an object with a `tag`"))
+    return problems

@@ -1,0 +1,90 @@
+"""What a run carries from stage to stage: its files, its plans, its results, and the station once it is needed."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+from control.settings import TrialSettings
+from drivers.station import Devices, Station
+from drivers.wire.log import LogWriter
+from experiments import setup
+from experiments.files import Resolved
+from experiments.progress import Progress
+from experiments.run_folder import RunFolder, write_json
+from mechanics.records import EventRecord, PhaseRecord, TrialRecord, WaypointRecord
+from planning.plan import Plan
+
+#: the streams have spoken before the first stage needs them [s]
+WARM_UP = 0.2
+
+Record = EventRecord | PhaseRecord | TrialRecord | WaypointRecord
+
+
+class RunContext:
+    """One run. `closing` holds what has to be closed in order, however the run ends."""
+
+    def __init__(
+        self,
+        resolved: Resolved,
+        folder: RunFolder,
+        results: dict[str, Any],
+        log: LogWriter,
+        progress: Progress,
+        closing: ExitStack,
+        ask: Callable[[str], bool],
+    ):
+        self.resolved = resolved
+        self.folder, self.results, self.log, self.progress = folder, results, log, progress
+        self.settings: TrialSettings = resolved.experiment.trial
+        self.plans: dict[str, Plan] = {}
+        self.holder = f"run-{socket.gethostname()}-{os.getpid()}"
+        self.ask = ask
+        self._closing = closing
+        self._devices: Devices | None = None
+
+    def devices(self) -> Devices:
+        """The station's devices, opened and logged at the first call; a simulated world is reset to the scene."""
+        if self._devices is None:
+            with self.progress.step("open the station"):
+                devices = self._closing.enter_context(Station(self.resolved.station).connect())
+                devices.attach(self.log)
+                if devices.simulation is not None:
+                    world = self.resolved.station.world
+                    devices.simulation.reset(
+                        self.resolved.experiment.seed,
+                        setup.scene(self.resolved).model_dump(),
+                        None if world is None else world.model_dump(),
+                    )
+                devices.clock.sleep(WARM_UP)
+            self._devices = devices
+        return self._devices
+
+    @property
+    def opened(self) -> Devices | None:
+        """The devices if the station was opened, else None."""
+        return self._devices
+
+    def now_ns(self) -> int:
+        """The station's time; 0 before it was opened."""
+        return 0 if self._devices is None else self._devices.clock.now_ns()
+
+    def write(self, record: Record) -> None:
+        """Put a record of the run into the log."""
+        self.log.write_record(record)
+
+    def event(self, level: str, text: str) -> None:
+        """Tell the person, the log and events.jsonl."""
+        record = EventRecord(self.now_ns(), level, text)
+        self.write(record)
+        with self.folder.events.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"t_ns": record.capture_ns, "level": level, "text": text}, ensure_ascii=False) + "\n")
+        self.progress.say(level, text)
+
+    def save(self) -> None:
+        """Write results.json as it stands."""
+        write_json(self.folder.results, self.results)

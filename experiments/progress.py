@@ -1,0 +1,62 @@
+"""Progress with time left on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.progress import Progress as Bars
+
+STYLES = {"info": "", "warning": "yellow", "error": "red"}
+
+
+class Progress:
+    """Shows what a run is doing on ``console``."""
+
+    def __init__(self, console: Console):
+        self.console = console
+
+    @contextmanager
+    def step(self, what: str) -> Iterator[None]:
+        """One thing of unknown length."""
+        if not self.console.is_terminal:
+            self.console.print(f"{escape(what)} ...")
+            yield
+            return
+        columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+        with Bars(*columns, console=self.console) as bars:
+            bars.add_task(escape(what), total=None)
+            yield
+
+    @contextmanager
+    def steps(self, what: str, total: int) -> Iterator[Callable[[], None]]:
+        """``total`` things; call what is yielded after each."""
+        if not self.console.is_terminal:
+            self.console.print(f"{escape(what)} ({total} waypoints) ...")
+            yield lambda: None
+            return
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
+        with Bars(*columns, console=self.console) as bars:
+            task = bars.add_task(escape(what), total=total)
+            yield lambda: bars.advance(task)
+
+    def say(self, level: str, text: str) -> None:
+        """One line to the person."""
+        self.console.print(f"{level}: {escape(text)}", style=STYLES.get(level, ""))

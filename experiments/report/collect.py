@@ -1,0 +1,212 @@
+"""From a run folder to the report's data: everything is read back from the log, the verdicts from results.json."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from drivers.errors import ProtocolError
+from drivers.wire.log_reader import LogReader
+from experiments.files import load
+from experiments.run_folder import RunFolder
+from mechanics import se2
+from mechanics.readings import TruthReading
+from mechanics.records import EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
+from planning.plan import Plan
+
+SECOND = 1e-9
+
+
+@dataclass
+class _Trial:
+    begin: TrialRecord
+    end: TrialRecord | None = None
+    waypoints: list[WaypointRecord] = field(default_factory=list)
+    phases: list[PhaseRecord] = field(default_factory=list)
+    truths: list[TruthReading] = field(default_factory=list)
+
+
+@dataclass
+class _Log:
+    trials: list[_Trial] = field(default_factory=list)
+    events: list[EventRecord] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    last_ns: int = 0
+    ending: str = "there is no log"
+
+
+def collect(folder: RunFolder) -> dict[str, Any]:
+    """The data that `experiments.report.page.render` takes, from what lies in ``folder``, torn or whole.
+
+    Raises InputError when the folder's experiment cannot be read.
+    """
+    resolved = load(str(folder.experiment))
+    results = json.loads(folder.results.read_text("utf-8")) if folder.results.is_file() else {}
+    log = _read(folder, resolved.experiment.report.playback_rate)
+    bodies = {"go": resolved.grasped, "eo": resolved.extrinsic}
+    return {
+        "title": resolved.experiment.name,
+        "created": results.get("started"),
+        "results": results,
+        "objects": {
+            role: None if shape is None else {"name": shape.name, "vertices": shape.polygon.vertices.tolist()}
+            for role, shape in bodies.items()
+        },
+        "grasp": resolved.grasp.tolist(),
+        "trials": [_trial(trial, resolved.grasp) for trial in log.trials],
+        "log": {
+            "file": folder.log.name,
+            "bytes": folder.log.stat().st_size if folder.log.is_file() else 0,
+            "messages": log.counts,
+            "lost": results.get("log", {}).get("lost"),
+            "seconds": log.last_ns * SECOND,
+            "ending": log.ending,
+        },
+        "events": [{"t": event.capture_ns * SECOND, "level": event.level, "text": event.text} for event in log.events],
+        "paper": None,
+    }
+
+
+def _read(folder: RunFolder, rate: float) -> _Log:
+    """One pass over the log; truth is thinned to ``rate`` [Hz] on the way."""
+    log = _Log()
+    if not folder.log.is_file():
+        return log
+    try:
+        reader = LogReader(folder.log)
+    except ProtocolError as error:
+        log.ending = error.got
+        return log
+    next_truth = 0
+    for message in reader.messages():
+        log.counts[message.topic] = log.counts.get(message.topic, 0) + 1
+        log.last_ns = max(log.last_ns, message.publish_ns)
+        is_truth = message.topic.endswith("/world/truth")
+        if is_truth and message.publish_ns < next_truth:
+            continue
+        if not is_truth and not message.topic.startswith("run/"):
+            continue
+        try:
+            value = message.value()
+        except ProtocolError:
+            continue
+        if isinstance(value, TruthReading):
+            next_truth = message.publish_ns + round(1e9 / rate) - 1
+        _file(log, value)
+    log.ending = reader.ending
+    return log
+
+
+def _file(log: _Log, value: object) -> None:
+    current = log.trials[-1] if log.trials and log.trials[-1].end is None else None
+    if isinstance(value, EventRecord):
+        log.events.append(value)
+    elif isinstance(value, TrialRecord):
+        if value.status and current is not None:
+            current.end = value
+        elif not value.status:
+            log.trials.append(_Trial(value))
+    elif current is None:
+        return
+    elif isinstance(value, WaypointRecord):
+        current.waypoints.append(value)
+    elif isinstance(value, PhaseRecord):
+        current.phases.append(value)
+    elif isinstance(value, TruthReading):
+        current.truths.append(value)
+
+
+def _trial(trial: _Trial, grasp: Any) -> dict[str, Any]:
+    begin, end = trial.begin, trial.end
+    start_ns = begin.capture_ns
+    return {
+        "name": begin.trial,
+        "skill": begin.skill,
+        "controller": begin.controller,
+        "status": "unfinished" if end is None else end.status,
+        "reason": "the log breaks off here" if end is None else end.reason,
+        "waypoints": _waypoints(trial, start_ns),
+        "playback": _playback(trial, start_ns) if trial.truths else _from_waypoints(trial, start_ns),
+    }
+
+
+def _states(states: Iterable[PlanarState | None]) -> dict[str, list[Any]]:
+    out: dict[str, list[Any]] = {"ee": [], "go": [], "eo": [], "wrench": []}
+    for state in states:
+        for name, series in out.items():
+            value = None if state is None else getattr(state, name)
+            series.append(None if value is None else value.tolist())
+    return out
+
+
+def _waypoints(trial: _Trial, start_ns: int) -> dict[str, Any]:
+    points = trial.waypoints
+    simulated = any(point.truth is not None for point in points)
+    contacts: list[list[dict[str, Any]]] = [[] for _ in points]
+    if trial.end is not None and trial.end.plan:
+        plan = Plan.from_dict(json.loads(trial.end.plan))
+        contacts = [_planned_contacts(plan, point.step) for point in points]
+    return {
+        "t": [(point.capture_ns - start_ns) * SECOND for point in points],
+        "planned": _states(point.planned for point in points),
+        "measured": _states(point.measured for point in points),
+        "truth": _states(point.truth for point in points) if simulated else None,
+        "contacts": contacts,
+    }
+
+
+def _planned_contacts(plan: Plan, step: int) -> list[dict[str, Any]]:
+    """The planned contacts at a step, forces in W: f_n along the normal, f_t along the normal turned by −90°."""
+    out = []
+    for c, name in enumerate(plan.contact_names):
+        normal, (f_n, f_t) = plan.contact_normals[step, c], plan.contact_forces[step, c]
+        force = f_n * normal + f_t * se2.rotate(np.array(-np.pi / 2), normal)
+        out.append(
+            {
+                "name": name,
+                "point": plan.contact_points[step, c].tolist(),
+                "normal": normal.tolist(),
+                "force": force.tolist(),
+                "mode": plan.contact_modes[step][c].value,
+            }
+        )
+    return out
+
+
+def _phase_at(trial: _Trial, capture_ns: int) -> str:
+    before = [phase.phase for phase in trial.phases if phase.capture_ns <= capture_ns]
+    return before[-1] if before else ""
+
+
+def _playback(trial: _Trial, start_ns: int) -> dict[str, Any]:
+    """The plant's own motion."""
+    truths = trial.truths
+    return {
+        "source": "truth",
+        "t": [(truth.stamp.capture_ns - start_ns) * SECOND for truth in truths],
+        **_states(PlanarState(truth.ee, truth.go, truth.eo, truth.wrench) for truth in truths),
+        "contacts": [
+            [
+                {"point": c.point.tolist(), "force": c.force.tolist(), "mode": c.mode, "on": c.on, "by": c.by}
+                for c in truth.contacts
+            ]
+            for truth in truths
+        ],
+        "phase": [_phase_at(trial, truth.stamp.capture_ns) for truth in truths],
+    }
+
+
+def _from_waypoints(trial: _Trial, start_ns: int) -> dict[str, Any]:
+    """Without truth, as on hardware: what was measured at the waypoints."""
+    points = trial.waypoints
+    return {
+        "source": "estimate",
+        "t": [(point.capture_ns - start_ns) * SECOND for point in points],
+        **_states(point.measured for point in points),
+        "contacts": [[] for _ in points],
+        "phase": [_phase_at(trial, point.capture_ns) for point in points],
+    }

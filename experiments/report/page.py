@@ -1,0 +1,68 @@
+"""Put the report's page together: tables from the results, scene and traces from the recorded trials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from experiments.report import payload, summary, traces
+
+
+def render(data: Mapping[str, Any]) -> str:
+    """One self-contained HTML page of a run; opened from disk it makes no request.
+
+    ``data`` is JSON-able: ``results`` (results.json), ``title``, ``created``, ``objects`` (outlines in body frames
+    [m]), ``grasp`` X_go_gocf, ``trials`` (way-points and playback: poses (x, y, θ) in W, wrenches (fx, fy, τ) of the
+    sensor on the go about the grasp centre, axes of W, contacts with point and force in W; SI), ``log``, ``events``,
+    ``paper`` (see `summary.error_table`). What is missing, None or NaN is left out and the page says so, so that an
+    aborted, empty or torn run has its report as well. Raises TypeError when ``data`` is no mapping.
+    """
+    if not isinstance(data, Mapping):
+        raise TypeError(f"render: expected a mapping with results, trials, objects …, got {type(data).__name__}")
+    data = payload.clean(data)
+    results = data.get("results") if isinstance(data.get("results"), dict) else {}
+    carried = payload.build(data)
+    figures = [traces.figure(trial) for trial in carried["trials"]]
+    plotted = any(figure is not None for figure in figures)
+    provenance = results.get("provenance")
+    carried["figures"] = [None if f is None else payload.clean(traces.skeleton(f), payload.DIGITS) for f in figures]
+    return _template().render(
+        title=str(data.get("title") or "Untitled run"),
+        verdict=summary.verdict(results),
+        facts=summary.facts(data),
+        table=summary.error_table(results, data.get("paper")),
+        plans=summary.plan_rows(results),
+        calibration=list(summary.leaves(results.get("calibration") or {})),
+        provenance=list(summary.leaves(provenance)) if provenance else [],
+        log=summary.log_summary(data.get("log"), len(results.get("trials") or [])),
+        events=summary.event_rows(data.get("events")),
+        trials=carried["trials"],
+        playable=any(trial["playback"] is not None for trial in carried["trials"]),
+        plotted=plotted,
+        data=payload.encode(carried),
+        style=_text("style.css"),
+        scripts={name: _text(name) for name in ("scene.js", "player.js", "traces.js")},
+        plotly=_plotly() if plotted else "",
+    )
+
+
+def _text(name: str) -> str:
+    return (files("experiments.report") / name).read_text(encoding="utf-8")
+
+
+@cache
+def _plotly() -> str:
+    from plotly.offline import get_plotlyjs
+
+    # Only inside strings can these occur, where the backslash changes nothing.
+    return get_plotlyjs().replace("</script", "<\\/script").replace("<!--", "<\\!--")
+
+
+@cache
+def _template():
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return environment.from_string(_text("template.html.j2"))

@@ -1,0 +1,225 @@
+"""The run in words and rows: verdict, facts, error tables, what the log holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeGuard
+
+COMPLETED = {"completed", "done", "ok", "success"}
+SHORT = {"fell_short", "short", "shortfall", "slipped", "lost_contact", "diverged"}
+ABORTING = {"stopped", "device_failed"}  # trials that end so take the run with them (exit codes 3 and 4)
+
+# key in M of results.json, column head, unit, decimals
+AGGREGATES = (
+    ("go_pose_mm", "Pose error, grasped object", "mm", 3),
+    ("eo_pose_mm", "Pose error, extrinsic object", "mm", 3),
+    ("wrench_N", "Wrench error", "N", 3),
+)
+COMPONENTS = (
+    ("fx_N", "fx", "N", 3),
+    ("fy_N", "fy", "N", 3),
+    ("tau_Nmm", "τ", "N·mm", 2),
+    ("x_mm", "x", "mm", 3),
+    ("y_mm", "y", "mm", 3),
+    ("theta_deg", "θ", "deg", 3),
+)
+SOURCES = ("measured", "truth", "paper")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How the run ended: ``level`` is completed, short or aborted; ``headline`` and ``detail`` say it in words."""
+
+    level: str
+    headline: str
+    detail: str
+
+
+def words(status: Any) -> str:
+    """A status as people write it: ``lost_contact`` → lost contact."""
+    return str(status).replace("_", " ") if status else "unknown"
+
+
+def verdict(results: Mapping[str, Any]) -> Verdict:
+    """The verdict of a run from its results.json (design §6, §7): the run's own status and those of its trials."""
+    trials = _trials(results)
+    status = str(results.get("status") or "")
+    done = sum(trial.get("status") in COMPLETED for trial in trials)
+    count = f"{done} of {len(trials)} trial{'s' * (len(trials) != 1)} completed" if trials else "no trial was executed"
+    reason = str(results.get("reason") or "").strip().rstrip(".")
+    tail = f": {reason}." if reason else "."
+    failed = next((trial for trial in trials if trial.get("status") in ABORTING), None)
+    if not status:
+        return Verdict("aborted", "Aborted", f"results.json does not say how the run ended; {count}.")
+    if status not in COMPLETED | SHORT:
+        return Verdict("aborted", "Aborted", f"{count}; the run ended with status “{words(status)}”{tail}")
+    if failed is not None:
+        return Verdict("aborted", "Aborted", f"{count}; a trial ended with status “{words(failed['status'])}”{tail}")
+    if done < len(trials) or status in SHORT:
+        return Verdict("short", "Fell short", count + tail)
+    return Verdict("completed", "Completed", count + tail)
+
+
+def level(status: Any) -> str:
+    """The verdict level of one trial's status."""
+    return "completed" if status in COMPLETED else "aborted" if status in ABORTING or not status else "short"
+
+
+def facts(data: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Label and value of what identifies the run; a fact that was not recorded says so."""
+    results = _mapping(data.get("results"))
+    station, provenance = results.get("station"), _mapping(results.get("provenance"))
+    world = _mapping(_mapping(station).get("world"))
+    profile = results.get("profile") or _mapping(station).get("profile") or world.get("profile")
+    name = _mapping(station).get("name") if isinstance(station, Mapping) else station
+    seed = results.get("seed")
+    pairs = [
+        ("Experiment", _name(results.get("experiment"))),
+        ("Station", name),
+        ("Profile", profile or provenance.get("profile")),
+        ("Seed", seed),
+        ("Git", _git(provenance.get("git"))),
+        ("Created", data.get("created")),
+    ]
+    return [(label, str(value) if value not in (None, "") else "not recorded") for label, value in pairs]
+
+
+def _name(value: Any) -> Any:
+    return value.get("name") if isinstance(value, Mapping) else value
+
+
+def _git(value: Any) -> str:
+    if not isinstance(value, Mapping):
+        return str(value or "")
+    commit = str(value.get("commit") or value.get("revision") or value.get("hash") or "")
+    return f"{commit[:12]}{' (with local changes)' if value.get('dirty') else ''}" if commit else ""
+
+
+def error_table(results: Mapping[str, Any], paper: Any = None) -> dict[str, Any]:
+    """Rows of the error tables; ``heads`` and ``sources`` name only what some trial has.
+
+    ``paper`` may hold ``{"source": text, "rows": {trial name: M}}``: figures of the paper to show beside.
+    Each row's ``aggregates[key][source]`` and ``components[source][key]`` is (mean, std) as text, or None.
+    """
+    trials, beside = _trials(results), _mapping(_mapping(paper).get("rows"))
+    figures = [
+        {"measured": trial.get("measured"), "truth": trial.get("truth"), "paper": beside.get(str(trial.get("name")))}
+        for trial in trials
+    ]
+    sources = [s for s in SOURCES if s != "paper" or any(f["paper"] for f in figures)]
+    heads = [h for h in AGGREGATES if h[0] != "eo_pose_mm" or any(_has(f, h[0]) for f in figures)]
+    rows = []
+    for trial, figure in zip(trials, figures, strict=True):
+        status = trial.get("status")
+        row = {
+            "name": str(trial.get("name") or "unnamed"),
+            "skill": words(trial.get("skill")),
+            "controller": words(trial.get("controller")),
+            "status": words(status),
+            "level": level(status),
+            "reason": str(trial.get("reason") or ""),
+            "aggregates": {h[0]: {s: _figure(figure[s], h[0], h[3]) for s in sources} for h in heads},
+            "components": {s: {c[0]: _figure(figure[s], c[0], c[3]) for c in COMPONENTS} for s in sources},
+        }
+        rows.append(row)
+    source = str(_mapping(paper).get("source") or "the paper")
+    return {"heads": heads, "components": COMPONENTS, "sources": sources, "rows": rows, "paper": source}
+
+
+def _has(figure: Mapping[str, Any], key: str) -> bool:
+    return any(_mapping(_mapping(m).get(key)).get("mean") is not None for m in figure.values())
+
+
+def _figure(values: Any, key: str, decimals: int) -> tuple[str, str | None] | None:
+    entry = _mapping(_mapping(values).get(key))
+    mean, std = entry.get("mean"), entry.get("std")
+    if not _is_number(mean):
+        return None
+    return f"{mean:.{decimals}f}", f"{std:.{decimals}f}" if _is_number(std) else None
+
+
+def _is_number(value: Any) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def log_summary(log: Any, trials: int) -> dict[str, Any] | None:
+    """What the log holds, per topic and in sum; None where there is no log.
+
+    An optional ``torn`` (true, or what is known of it) marks a log that was cut off.
+    """
+    source = _mapping(log)
+    if not source:
+        return None
+    counts = {str(k): int(v) for k, v in _mapping(source.get("messages")).items() if _is_number(v)}
+    seconds, size, lost = (v if _is_number(v := source.get(key)) else None for key in ("seconds", "bytes", "lost"))
+    torn = source.get("torn")
+    return {
+        "file": str(source.get("file") or "log.mcap"),
+        "total": f"{sum(counts.values()):,}",
+        "lost": None if lost is None else int(lost),
+        "size": None if size is None else f"{size / 1e6:.2f} MB",
+        "per_trial": None if size is None or not trials else f"{size / 1e6 / trials:.2f} MB",
+        "seconds": None if seconds is None else f"{seconds:.1f} s",
+        "torn": "" if not torn else torn if isinstance(torn, str) else "The log was cut off before it was closed.",
+        "topics": [(t, f"{n:,}", f"{n / seconds:.1f}" if seconds else "–") for t, n in sorted(counts.items())],
+    }
+
+
+def event_rows(events: Any) -> list[dict[str, str]]:
+    """Time [s] as text, level and words of each event, in the order given."""
+    rows = []
+    for event in events if isinstance(events, list | tuple) else []:
+        source = _mapping(event)
+        t = source.get("t")
+        severity = str(source.get("level") or "info")
+        rows.append(
+            {
+                "t": f"{t:.2f}" if _is_number(t) else "–",
+                "level": severity if severity in ("info", "warning", "error") else "info",
+                "text": str(source.get("text") or ""),
+            }
+        )
+    return rows
+
+
+def plan_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
+    """The plans of results.json as text: name, skill, planner, steps, queries, time, loss, status."""
+    keys = ("name", "skill", "planner", "steps", "queries", "time_s", "loss", "status")
+    plans = results.get("plans")
+    return [
+        {key: _plain(_mapping(plan).get(key)) for key in keys} for plan in (plans if isinstance(plans, list) else [])
+    ]
+
+
+def leaves(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted path and text of every leaf of a nested mapping; a list of plain values is one leaf."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from leaves(item, f"{path}.{key}" if path else str(key))
+    elif isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+        for index, item in enumerate(value):
+            yield from leaves(item, f"{path}[{index}]")
+    else:
+        yield path, _plain(value)
+
+
+def _plain(value: Any) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return ", ".join(f"[{_plain(item)}]" if isinstance(item, list) else _plain(item) for item in value)
+    return str(value)
+
+
+def _mapping(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _trials(results: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    trials = results.get("trials")
+    return [_mapping(trial) for trial in trials] if isinstance(trials, list | tuple) else []

@@ -1,0 +1,169 @@
+"""Runs an experiment from resolved files to the run folder, and ends in order however it ends."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from drivers.errors import CommandRefused, DriverError
+from drivers.wire.log import LogWriter
+from experiments.check import check
+from experiments.context import RunContext
+from experiments.exit_codes import STATUS, ExitCode, of_trials
+from experiments.files import Resolved, dump_resolved
+from experiments.progress import Progress
+from experiments.provenance import provenance
+from experiments.report.build import build_report
+from experiments.run_folder import RunFolder, write_atomic, write_json
+from experiments.stages import STAGES
+from planning.errors import InfeasiblePlan
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended and where it lies."""
+
+    exit_code: ExitCode
+    folder: RunFolder
+    results: dict[str, Any]
+    reason: str = ""
+
+
+def run(resolved: Resolved, out: Path | None = None, console: Console | None = None) -> Outcome:
+    """Run an experiment. Raises InputError before anything was started; every later end is in the outcome."""
+    console = console or Console(stderr=True)
+    check(resolved)  # what a dry run can find is found before anything is written
+    folder = RunFolder.create(resolved.experiment.name, out)
+    write_atomic(folder.experiment, dump_resolved(resolved))
+    results: dict[str, Any] = {
+        "schema": 1,
+        "status": "running",
+        "reason": "",
+        "experiment": resolved.experiment.name,
+        "station": resolved.station.name,
+        "profile": None if resolved.station.world is None else resolved.station.world.profile,
+        "seed": resolved.experiment.seed,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "provenance": provenance(),
+        "calibration": {},
+        "plans": [],
+        "trials": [],
+        "tables": [],
+    }
+    with interruptible() as end_quietly:
+        code, reason = ExitCode.DONE, ""
+        try:
+            code, reason = _stages(resolved, folder, results, console, end_quietly)
+        except KeyboardInterrupt:
+            code, reason = ExitCode.INTERRUPTED, "interrupted by the user"
+        end_quietly()
+        results["status"], results["reason"] = STATUS[code], reason
+        results["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
+        outcome = Outcome(code, folder, results, reason)
+        _finish(outcome, console)
+    return outcome
+
+
+def _stages(
+    resolved: Resolved,
+    folder: RunFolder,
+    results: dict[str, Any],
+    console: Console,
+    closing_begins: Callable[[], None],
+) -> tuple[ExitCode, str]:
+    """Run all stages with log and station open, close both in order, and say how it ended."""
+    progress = Progress(console)
+    code, reason = ExitCode.DONE, ""
+    with ExitStack() as closing:
+        log = closing.enter_context(LogWriter(folder.log, flush=resolved.station.log.flush))
+        log.add_attachment("experiment.yaml", "application/yaml", folder.experiment.read_bytes())
+        context = RunContext(resolved, folder, results, log, progress, closing, _ask(console))
+        context.save()
+        try:
+            for stage in resolved.experiment.stages:
+                STAGES[stage.stage](context, stage)
+                code, reason = of_trials(results["trials"])
+                if code in (ExitCode.DEVICE_FAILED, ExitCode.STOPPED):
+                    break
+        except InfeasiblePlan as error:
+            code, reason = ExitCode.INFEASIBLE, str(error)
+        except CommandRefused as error:
+            code, reason = ExitCode.DEVICE_FAILED, str(error)
+        except DriverError as error:
+            code, reason = ExitCode.DEVICE_FAILED, str(error)
+        except KeyboardInterrupt:
+            code, reason = ExitCode.INTERRUPTED, "interrupted by the user"
+        closing_begins()
+        if code in (ExitCode.INFEASIBLE, ExitCode.INTERRUPTED, ExitCode.DEVICE_FAILED):
+            context.event("error", reason)
+        results["log"] = _accounts(context, log)
+    return code, reason
+
+
+def _accounts(context: RunContext, log: LogWriter) -> dict[str, Any]:
+    """What was logged beside what was published, per topic; ``lost`` is the difference."""
+    published: dict[str, int] = {}
+    devices = context.opened
+    if devices is not None and devices.simulation is not None:
+        try:
+            published = devices.simulation.counts()
+        except DriverError:
+            published = {}
+    log.drain()
+    logged = log.counts
+    lost = sum(max(0, count - logged.get(topic, 0)) for topic, count in published.items()) + log.overflows
+    return {"file": context.folder.log.name, "messages": logged, "published": published, "lost": lost}
+
+
+def _finish(outcome: Outcome, console: Console) -> None:
+    """Results and report; a report that cannot be made never takes the results with it."""
+    write_json(outcome.folder.results, outcome.results)
+    try:
+        build_report(outcome.folder)
+    except Exception as error:  # the run is over and its data are safe: say it and go on
+        console.print(f"[yellow]the report could not be made: {error}[/]\n  extrinsic report {outcome.folder.path}")
+
+
+def _ask(console: Console) -> Callable[[str], bool]:
+    def ask(what: str) -> bool:
+        if not sys.stdin.isatty():
+            return False
+        console.print(f"[yellow]{what}[/]\nReset the scene, then press Enter; type q and Enter to end the run.")
+        return sys.stdin.readline().strip().lower() != "q"
+
+    return ask
+
+
+@contextmanager
+def interruptible() -> Iterator[Callable[[], None]]:
+    """SIGINT and SIGTERM raise KeyboardInterrupt once; after that, or once what is yielded was called, they only tell.
+
+    So closing cannot be cut short by a second Ctrl-C: the arm is held and the log is closed first.
+    """
+    closing = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield closing.set
+        return
+
+    def on_signal(_number: int, _frame: object) -> None:
+        if closing.is_set():
+            sys.stderr.write("closing: the arm is held and the log is being written\n")
+            return
+        closing.set()
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield closing.set
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,139 @@
+"""The stages an experiment is made of: each takes the run's context and does one thing."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from control.base import Controller
+from control.observe import Observer
+from control.trial import Trial, TrialResult, Watch
+from drivers.station import Devices
+from estimation.force_torque import WristSensor
+from experiments import registries, setup
+from experiments.context import RunContext
+from experiments.metrics import errors_of
+from experiments.schema import ExecuteStage, PlanStage
+from mechanics.camera import CameraModel
+from mechanics.records import PhaseRecord, PlanarState, TrialRecord, WaypointRecord
+from planning.plan import Plan
+
+
+def plan_stage(context: RunContext, stage: PlanStage) -> None:
+    """Make the plan that later stages execute. Raises InfeasiblePlan."""
+    from planning.planner import plan
+
+    begin = time.perf_counter()
+    with context.progress.step(f"plan {stage.name}"):
+        made = plan(setup.task(context.resolved, stage), stage.name, backend=stage.backend)
+    context.plans[stage.name] = made
+    context.results["plans"].append(
+        {
+            "name": made.name,
+            "skill": made.skill,
+            "planner": made.planner,
+            "steps": len(made.ee),
+            "queries": made.queries,
+            "time_s": time.perf_counter() - begin,
+            "loss": made.loss,
+            "status": made.status,
+        }
+    )
+
+
+def execute_stage(context: RunContext, stage: ExecuteStage) -> None:
+    """Run ``trials`` trials of the plan under each controller. A trial that fails does not end the stage.
+
+    A device that fails does: what cannot be commanded any more is not tried again.
+    """
+    plan = context.plans[stage.plan]
+    devices = context.devices()
+    with devices.arm.lease(context.holder):
+        for trial in range(stage.trials):
+            for name in stage.controllers:
+                result = _one_trial(context, devices, plan, registries.controllers()[name], trial)
+                if result.status in ("device_failed", "stopped", "diverged"):
+                    return
+
+
+def _one_trial(
+    context: RunContext, devices: Devices, plan: Plan, controller: type[Controller], trial: int
+) -> TrialResult:
+    name = f"{plan.name}-{controller.name}-{trial}"
+    begin = TrialRecord(devices.clock.now_ns(), name, plan.skill, controller.name)
+    context.write(begin)
+    waypoints: list[WaypointRecord] = []
+    with context.progress.steps(f"{controller.name} {trial + 1}", len(plan.ee)) as advance:
+
+        def on_waypoint(record: WaypointRecord) -> None:
+            witnessed = replace(record, truth=_truth(devices))
+            waypoints.append(witnessed)
+            context.write(witnessed)
+            advance()
+
+        watch = Watch(
+            waypoint=on_waypoint,
+            phase=lambda phase, _fraction: context.write(PhaseRecord(devices.clock.now_ns(), name, phase)),
+            event=lambda level, text: context.event(level, f"{name}: {text}"),
+            reset_scene=context.ask if devices.simulation is None else lambda _what: False,
+        )
+        observer = _observer(context, devices)
+        clock, load = devices.clock, setup.free_air_load(context.resolved)
+        result = Trial(name, plan, controller, observer, clock, load, context.settings, watch).run()
+    context.results["trials"].append(_row(context, name, controller.name, trial, result, waypoints))
+    end = replace(begin, status=result.status, reason=result.reason, plan=json.dumps(result.plan.to_dict()))
+    context.write(replace(end, capture_ns=context.now_ns()))
+    context.save()
+    return result
+
+
+def _observer(context: RunContext, devices: Devices) -> Observer:
+    wrist = devices.force_torque("wrist")
+    settings = context.settings
+    return Observer(
+        arm=devices.arm,
+        wrist=wrist,
+        camera=devices.camera,
+        camera_model=CameraModel.from_dict(devices.camera.describe().extra["camera"]),
+        tags=setup.tags(context.resolved),
+        wrist_sensor=WristSensor(np.array(wrist.describe().extra["pose"], float), np.zeros(3)),
+        grasp=context.resolved.grasp,
+        window_ns=round(settings.window * 1e9),
+        frames=settings.tag_frames,
+    )
+
+
+def _truth(devices: Devices) -> PlanarState | None:
+    if devices.simulation is None:
+        return None
+    truth = devices.simulation.truth()
+    return PlanarState(truth.ee, truth.go, truth.eo, truth.wrench)
+
+
+def _row(
+    context: RunContext, name: str, controller: str, trial: int, result: TrialResult, waypoints: list[WaypointRecord]
+) -> dict[str, Any]:
+    grasped, extrinsic = context.resolved.grasped, context.resolved.extrinsic
+    rho_go = grasped.polygon.radius_of_gyration
+    rho_eo = None if extrinsic is None else extrinsic.polygon.radius_of_gyration
+    return {
+        "name": name,
+        "skill": result.plan.skill,
+        "planner": result.plan.planner,
+        "controller": controller,
+        "grasped_object": grasped.name,
+        "extrinsic_object": None if extrinsic is None else extrinsic.name,
+        "sensor": context.resolved.sensor.name,
+        "trial": trial,
+        "status": result.status,
+        "reason": result.reason,
+        **{witness: errors_of(waypoints, witness, rho_go, rho_eo, rho_go) for witness in ("measured", "truth")},
+    }
+
+
+STAGES: dict[str, Callable[[RunContext, Any], None]] = {"plan": plan_stage, "execute": execute_stage}

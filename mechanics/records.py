@@ -1,0 +1,67 @@
+"""What a run writes down of itself, as frozen values: waypoints, the plan of each trial, its phases, events."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mechanics.readings import Array
+
+
+@dataclass(frozen=True, slots=True)
+class PlanarState:
+    """Poses (3,) in W of end-effector, grasped and extrinsic object, and the wrench (3,) of the sensor on the go.
+
+    The wrench is about the grasp centre, axes of W [N, N, N·m]. None stands for what is not there or was not seen.
+    """
+
+    ee: Array
+    go: Array | None
+    eo: Array | None
+    wrench: Array
+
+
+@dataclass(frozen=True, slots=True)
+class WaypointRecord:
+    """One settled waypoint of a trial: planned (anchored to the table), commanded ee pose, measured, and true.
+
+    ``truth`` is the plant's own state, filled in by the runner in simulation only.
+    """
+
+    capture_ns: int
+    trial: str
+    step: int
+    planned: PlanarState
+    commanded: Array
+    measured: PlanarState
+    truth: PlanarState | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TrialRecord:
+    """The begin (``status`` empty) or the end of a trial. ``plan`` is the anchored plan as JSON, at the end only."""
+
+    capture_ns: int
+    trial: str
+    skill: str
+    controller: str
+    status: str = ""
+    reason: str = ""
+    plan: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseRecord:
+    """A trial enters ``phase``."""
+
+    capture_ns: int
+    trial: str
+    phase: str
+
+
+@dataclass(frozen=True, slots=True)
+class EventRecord:
+    """Something a person should know: ``level`` is ``info``, ``warning`` or ``error``."""
+
+    capture_ns: int
+    level: str
+    text: str

@@ -1,0 +1,158 @@
+"""A plan: where everything is and which forces act, at each step, with the ramps before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import numpy as np
+
+from mechanics import se2, wrench
+from mechanics.contact import gravity_wrench
+from mechanics.elasticity import Elasticity
+from mechanics.friction import Mode
+from mechanics.readings import Array
+
+SCHEMA = 1
+
+_POSES = ("ee", "go", "eo", "preload_ee", "preload_go", "unload_ee", "unload_go")
+_WRENCHES = ("wrench", "preload_wrench", "unload_wrench")
+_SHAPES = {
+    "X_go_gocf": (3,),
+    "stiffness": (3, 3),
+    "com": (2,),
+    **dict.fromkeys(("ee", "go", "eo", "wrench"), ("K", 3)),
+    **dict.fromkeys(("contact_points", "contact_normals", "contact_forces"), ("K", "C", 2)),
+    "contact_mu": ("C",),
+    **dict.fromkeys(("preload_ee", "preload_go", "preload_wrench"), ("M", 3)),
+    **dict.fromkeys(("unload_ee", "unload_go", "unload_wrench"), ("N", 3)),
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Plan:
+    """K steps, C contacts, in the frame W that the plan was made in (or moved to, see `reanchored`).
+
+    Poses (K, 3) are X_W_ee, X_W_go and X_W_eo (None without an extrinsic object). ``wrench`` (K, 3) [N, N, N·m] is of
+    the sensor on the go about the grasp centre, axes of W. Contacts: ``contact_points`` and unit
+    ``contact_normals`` (K, C, 2) in W, ``contact_forces`` (K, C, 2) as (f_n, f_t) [N], ``contact_modes`` K × C,
+    ``contact_mu`` (C,), ``contact_names`` C; signs as in `mechanics.friction`.
+
+    ``preload_*`` (M, 3): the contact force grows from none to the first step's while the go stays at the first step's
+    pose, both ends included; ``unload_*`` (N, 3): it falls to none at the last pose. ``mass`` [kg], ``com`` (2,) [m]
+    in the go's frame and ``gravity`` [m/s²] along −y are what the wrenches carry; ``stiffness`` (3, 3) is the finger's
+    in gocf. ``loss`` is the mean of the program's objective, ``queries`` the number of programs solved, ``time_s``
+    the seconds that took. Arrays are read-only.
+    """
+
+    name: str
+    skill: str
+    planner: str
+    X_go_gocf: Array
+    stiffness: Array
+    mass: float
+    com: Array
+    gravity: float
+    ee: Array
+    go: Array
+    eo: Array | None
+    wrench: Array
+    contact_names: tuple[str, ...]
+    contact_points: Array
+    contact_normals: Array
+    contact_forces: Array
+    contact_modes: tuple[tuple[Mode, ...], ...]
+    contact_mu: Array
+    preload_ee: Array
+    preload_go: Array
+    preload_wrench: Array
+    unload_ee: Array
+    unload_go: Array
+    unload_wrench: Array
+    status: str = "solved"
+    loss: float = 0.0
+    queries: int = 0
+    time_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        sizes: dict[str, int] = {"C": len(self.contact_names)}
+        object.__setattr__(self, "contact_names", tuple(self.contact_names))
+        for name, shape in _SHAPES.items():
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, _checked(self.name, name, value, shape, sizes))
+        modes = tuple(tuple(Mode(mode) for mode in row) for row in self.contact_modes)
+        if len(modes) != sizes["K"] or any(len(row) != sizes["C"] for row in modes):
+            raise ValueError(
+                f"plan '{self.name}': contact_modes: expected {sizes['K']} rows of {sizes['C']} modes,"
+                f" received {len(modes)} rows of {sorted({len(row) for row in modes})}"
+            )
+        object.__setattr__(self, "contact_modes", modes)
+
+    @property
+    def steps(self) -> int:
+        """K."""
+        return len(self.ee)
+
+    def free_air_ee(self, X_W_go: Array) -> Array:
+        """Return X_W_ee (..., 3) that holds the go at ``X_W_go`` (..., 3) in free air, carrying only its weight."""
+        arm = se2.rotate(np.asarray(X_W_go)[..., 2], self.com - self.X_go_gocf[:2])
+        carried = -gravity_wrench(self.mass, arm, self.gravity)
+        return Elasticity(self.stiffness).ee_pose(X_W_go, self.X_go_gocf, carried)
+
+    def reanchored(self, X_W_table: Array) -> Self:
+        """Return the plan for a table whose frame sits at ``X_W_table`` (3,) where this plan's table sits at identity.
+
+        Poses, points, normals and wrenches move with the table; (f_n, f_t) stay. Gravity stays along −y of W: a table
+        that leans carries the plan's forces with it, not the weight's direction.
+        """
+        X_W_table = np.asarray(X_W_table, dtype=np.float64)
+        moved: dict[str, Any] = {
+            name: se2.compose(X_W_table, getattr(self, name)) for name in _POSES if getattr(self, name) is not None
+        }
+        moved |= {name: wrench.rotated(getattr(self, name), X_W_table[2]) for name in _WRENCHES}
+        moved["contact_points"] = se2.transform(X_W_table, self.contact_points)
+        moved["contact_normals"] = se2.rotate(X_W_table[2], self.contact_normals)
+        return replace(self, **moved)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what JSON can hold; `from_dict` gives back the same plan, to the last bit."""
+        plain: dict[str, Any] = {"schema": SCHEMA}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            plain[field.name] = value.tolist() if isinstance(value, np.ndarray) else value
+        plain["contact_names"] = list(self.contact_names)
+        plain["contact_modes"] = [[mode.value for mode in row] for row in self.contact_modes]
+        return plain
+
+    @classmethod
+    def from_dict(cls, plain: Mapping[str, Any]) -> Self:
+        """Return the plan of `to_dict`. Raises ValueError on another schema, and on keys missing or not known."""
+        schema = plain.get("schema")
+        if schema != SCHEMA:
+            raise ValueError(f"plan: schema: expected {SCHEMA}, received {schema!r}: plan again with this version")
+        expected, received = {field.name for field in fields(cls)}, set(plain) - {"schema"}
+        if expected != received:
+            wrong = [f"missing {sorted(expected - received)}"] * (not expected <= received)
+            wrong += [f"not known {sorted(received - expected)}"] * (not received <= expected)
+            raise ValueError(f"plan: keys: {'; '.join(wrong)}")
+        return cls(**{name: plain[name] for name in expected})
+
+
+def _checked(plan: str, name: str, value: object, shape: tuple[int | str, ...], sizes: dict[str, int]) -> Array:
+    """Return a read-only float64 copy of ``value``; letters in ``shape`` are bound by the first array that has them."""
+    array = np.array(value, dtype=np.float64)
+    if array.size == 0 and sizes["C"] == 0 and "C" in shape:  # JSON cannot tell (K, 0, 2) from (K, 0)
+        array = array.reshape([sizes[size] if isinstance(size, str) else size for size in shape])
+    matches = array.ndim == len(shape) and all(
+        size == (sizes.setdefault(want, size) if isinstance(want, str) else want)
+        for size, want in zip(array.shape, shape, strict=True)
+    )
+    if not matches:
+        wanted = tuple(sizes.get(want, want) if isinstance(want, str) else want for want in shape)
+        raise ValueError(f"plan '{plan}': {name}: expected shape {wanted}, received {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"plan '{plan}': {name}: expected finite numbers, received {array[~np.isfinite(array)][0]}")
+    array.setflags(write=False)
+    return array

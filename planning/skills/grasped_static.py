@@ -1,0 +1,63 @@
+"""Static in contact: the grasped object stands still while the force on the ground changes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from mechanics.readings import Array
+from planning.skills import stance
+from planning.skills.base import PositiveRamp, Ramp, Skill, SkillParameters, ramp, register
+from planning.task import Task
+
+
+class StaticParameters(SkillParameters):
+    """Static in contact.
+
+    ``angle_deg`` the go's tilt, counter-clockwise; ``force`` the normal force of the ground on the go [N], first and
+    last; ``tangential`` its force along +x [N], first and last; ``steps`` how many waypoints; ``contact_x`` [m] where
+    on the ground the corner stands (the left one of a face).
+    """
+
+    angle_deg: float = Field(default=15.0, ge=-180, le=180)
+    force: PositiveRamp = (3.0, 5.0)
+    tangential: Ramp = (0.0, 0.0)
+    steps: int = Field(default=20, ge=1, le=10_000)
+    contact_x: float = 0.0
+
+
+@register
+class GraspedStatic(Skill):
+    """The go stands on its lowest corner, or flat on a face whose two ends share the force evenly."""
+
+    name: ClassVar[str] = "grasped_static"
+    Parameters: ClassVar[type[SkillParameters]] = StaticParameters
+
+    @staticmethod
+    def task(
+        parameters: StaticParameters,
+        *,
+        polygon_vertices: Sequence[Sequence[float]] | Array,
+        mass: float,
+        grasp: Sequence[float] | Array,
+        stiffness: Sequence[Sequence[float]] | Array,
+        mu: float,
+        gravity: float = 9.81,
+    ) -> Task:
+        """Return the task; see `planning.skills.base.Skill.task`."""
+        vertices = stance.checked_vertices(polygon_vertices)
+        theta = np.full(parameters.steps, np.deg2rad(parameters.angle_deg))
+        points = stance.lowest_points(vertices, theta[0])
+        force = np.column_stack([ramp(parameters.force, len(theta)), ramp(parameters.tangential, len(theta))])
+        return Task(
+            skill=GraspedStatic.name,
+            go=stance.standing_pose(points[0], theta, parameters.contact_x),
+            contacts=stance.sticking_ground_contacts(points, mu, force),
+            X_go_gocf=np.asarray(grasp, dtype=np.float64),
+            mass=mass,
+            stiffness=np.asarray(stiffness, dtype=np.float64),
+            gravity=gravity,
+        )

@@ -1,0 +1,176 @@
+"""The backends that the device contract is held against, and the table of how they fared.
+
+A backend is one entry of `BACKENDS`: a context manager that takes a station and yields a `Lab` whose devices are open.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+
+import pytest
+
+from drivers.config import (
+    ArmConfig,
+    BusConfig,
+    ForceTorqueConfig,
+    GripperConfig,
+    StationConfig,
+    TagCameraConfig,
+    WorldConfig,
+)
+from drivers.interfaces import Arm, Clock, Device, Simulation
+from drivers.scene import Body, Scene, TagMount
+from drivers.sim.world import World
+from drivers.station import Station
+
+START = (0.0, 0.25, 0.1)
+
+SCENE = Scene(
+    grasped=Body(
+        name="tall_box",
+        vertices=((-0.025, -0.07345), (0.025, -0.07345), (0.025, 0.07345), (-0.025, 0.07345)),
+        mass=0.1,
+        tag=TagMount(id=3, size=0.036),
+    ),
+    grasp=(0.0, 0.045, 0.0),
+    stiffness=((2209.0, 0.0, 0.0), (0.0, 1876.0, 0.0), (0.0, 0.0, 3.2)),
+    friction={"go-ground": 0.33},
+    start=START,
+).model_dump(mode="json")
+
+
+@dataclass
+class Lab:
+    """An open station as its user sees it.
+
+    ``join`` opens it a second time, for another client; ``losing`` is a context in which what a device sends does not
+    arrive.
+    """
+
+    devices: Mapping[str, Device]
+    clock: Clock
+    simulation: Simulation
+    join: Callable[[], AbstractContextManager[Lab]]
+    losing: Callable[[Device], AbstractContextManager[None]]
+
+
+@contextmanager
+def in_process(config: StationConfig) -> Iterator[Lab]:
+    """The simulated devices themselves; a second client shares them."""
+    world = World(config)
+
+    @contextmanager
+    def join() -> Iterator[Lab]:
+        yield lab
+
+    @contextmanager
+    def losing(device) -> Iterator[None]:
+        device._push = lambda reading: None
+        yield
+        del device._push
+
+    lab = Lab(world.devices, world, world, join, losing)
+    for device in world.devices.values():
+        device.connect()
+    yield lab
+    for device in world.devices.values():
+        device.close()
+
+
+@contextmanager
+def over_zenoh(config: StationConfig) -> Iterator[Lab]:
+    """The simulated devices in a host process, over the bus; a second client is a second session."""
+
+    @contextmanager
+    def losing(device) -> Iterator[None]:
+        # the subscription goes on, since a stream that nobody subscribes to is not produced
+        subscription = device._subscription
+        handlers, subscription._handlers = subscription._handlers, ()
+        yield
+        subscription._handlers = handlers
+
+    with Station(config).connect() as devices:
+        assert devices.simulation is not None
+        yield Lab(devices, devices.clock, devices.simulation, lambda: over_zenoh(config), losing)
+
+
+BACKENDS: dict[str, Callable[[StationConfig], AbstractContextManager[Lab]]] = {
+    "sim in process": in_process,
+    "sim over zenoh": over_zenoh,
+}
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+@pytest.fixture(scope="module", params=list(BACKENDS))
+def opened(request: pytest.FixtureRequest) -> Iterator[Lab]:
+    """The backend's station, open for the whole module."""
+    config = StationConfig(
+        name="bench",
+        world=WorldConfig(),
+        bus=BusConfig(endpoint=free_endpoint()),
+        devices={
+            "arm": ArmConfig(kind="arm"),
+            "gripper": GripperConfig(kind="gripper"),
+            "wrist_ft": ForceTorqueConfig(kind="force_torque", mount="wrist"),
+            "camera": TagCameraConfig(
+                kind="tag_camera", width=640, height=480, focal=600.0, position=(0, -0.5, 0.2), look_at=(0, 0, 0.2)
+            ),
+        },
+    )
+    with BACKENDS[request.param](config) as lab:
+        yield lab
+
+
+@pytest.fixture
+def lab(opened: Lab) -> Lab:
+    """The station as new: every device open, the arm free, the world at its start."""
+    for device in opened.devices.values():
+        device.connect()
+    arm = opened.devices["arm"]
+    assert isinstance(arm, Arm)
+    arm.release()
+    arm.recover()
+    opened.simulation.reset(0, SCENE)
+    return opened
+
+
+@pytest.fixture
+def scene() -> dict:
+    """The scene that `lab` starts with."""
+    return SCENE
+
+
+# -- the table ---------------------------------------------------------------------------------------------------------
+
+_OUTCOMES: dict[tuple[str, str], list[bool]] = {}
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo) -> Iterator[None]:
+    outcome = yield
+    report = outcome.get_result()  # pyright: ignore[reportAttributeAccessIssue]
+    callspec = getattr(item, "callspec", None)
+    if callspec is None or "opened" not in callspec.params or (report.when != "call" and report.passed):
+        return
+    kind = callspec.params.get("kind") or getattr(getattr(item, "function", None), "kind", "station")
+    _OUTCOMES.setdefault((kind, callspec.params["opened"]), []).append(report.passed)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if not _OUTCOMES:
+        return
+    kinds = sorted({kind for kind, _ in _OUTCOMES})
+    terminalreporter.section("device conformance: claims that hold")
+    terminalreporter.write_line(f"{'':16}" + "".join(f"{backend:>20}" for backend in BACKENDS))
+    for kind in kinds:
+        cells = [_OUTCOMES.get((kind, backend)) for backend in BACKENDS]
+        texts = ["-" if cell is None else f"{sum(cell)} of {len(cell)}" for cell in cells]
+        terminalreporter.write_line(f"{kind:16}" + "".join(f"{text:>20}" for text in texts))

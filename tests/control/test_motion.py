@@ -1,0 +1,105 @@
+"""Ramps and paths: what reaches the arm, against the boundary conditions they promise."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from control.motion import Mover, quintic
+
+
+class Arm:
+    def __init__(self):
+        self.targets = []
+
+    def command(self, target):
+        self.targets.append(target)
+
+
+class Clock:
+    lockstep = True
+
+    def __init__(self):
+        self.slept = 0.0
+
+    def now_ns(self):
+        return round(self.slept * 1e9)
+
+    def sleep(self, seconds):
+        self.slept += seconds
+
+
+@pytest.fixture
+def arm():
+    return Arm()
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+def mover(arm, clock, start=(0.0, 0.0, 0.0)):
+    return Mover(arm, clock, 50.0, np.array(start), 0.05)
+
+
+def test_the_ramp_starts_and_ends_at_rest_and_is_symmetric():
+    assert quintic(0.0) == (0.0, 0.0)
+    assert quintic(1.0) == (1.0, 0.0)
+    assert quintic(0.5)[0] == pytest.approx(0.5)
+    assert quintic(0.5)[1] == pytest.approx(1.875)  # peak speed of minimum jerk
+
+
+@given(st.floats(0, 1))
+def test_the_slope_is_the_derivative_of_the_position(s):
+    h = 1e-6
+    assert quintic(s)[1] == pytest.approx((quintic(s + h)[0] - quintic(s - h)[0]) / (2 * h), abs=1e-6)
+
+
+def test_a_ramp_takes_its_time_and_ends_on_the_goal_at_rest(arm, clock):
+    mover(arm, clock).ramp(np.array([0.01, -0.02, 0.3]), 0.2)
+    assert clock.slept == pytest.approx(0.2)
+    assert arm.targets[-1].pose == pytest.approx([0.01, -0.02, 0.3])
+    assert arm.targets[-1].twist == pytest.approx([0.0, 0.0, 0.0])
+
+
+def test_a_turn_goes_the_short_way(arm, clock):
+    mover(arm, clock, (0, 0, 3.0)).ramp(np.array([0.0, 0.0, -3.0]), 0.2)
+    assert max(target.pose[2] for target in arm.targets) == pytest.approx(2 * np.pi - 3.0)
+
+
+def test_twists_integrate_to_the_displacement(arm, clock):
+    mover(arm, clock).ramp(np.array([0.05, 0.0, 0.0]), 1.0)
+    assert sum(target.twist[0] for target in arm.targets) * 0.02 == pytest.approx(0.05, rel=1e-4)
+
+
+def test_a_path_passes_through_its_points_in_order(arm, clock):
+    path = np.array([[0.01, 0.0, 0.0], [0.01, 0.01, 0.0], [0.0, 0.01, 0.0]])
+    mover(arm, clock).through(path, 1.0)
+    reached = np.array([target.pose for target in arm.targets])
+    assert [np.abs(reached - point).sum(axis=1).argmin() for point in path] == sorted(
+        np.abs(reached - point).sum(axis=1).argmin() for point in path
+    )
+    assert reached[-1] == pytest.approx(path[-1])
+    on_the_polyline = np.minimum(
+        np.abs(reached[:, 1]), np.minimum(np.abs(reached[:, 0] - 0.01), np.abs(reached[:, 1] - 0.01))
+    )
+    assert on_the_polyline.max() < 1e-12
+
+
+def test_resting_repeats_the_set_point(arm, clock):
+    mover(arm, clock, (0.1, 0.2, 0.3)).rest(0.1)
+    assert len(arm.targets) == 5
+    assert all((target.pose == [0.1, 0.2, 0.3]).all() and not target.twist.any() for target in arm.targets)
+
+
+def test_sequence_numbers_count_up(arm, clock):
+    moving = mover(arm, clock)
+    moving.rest(0.1)
+    moving.ramp(np.array([0.01, 0.0, 0.0]), 0.1)
+    assert [target.sequence for target in arm.targets] == list(range(1, 11))
+
+
+def test_free_motions_keep_to_the_speed(arm, clock):
+    mover(arm, clock).travel(np.array([0.1, 0.0, 0.0]))
+    assert clock.slept == pytest.approx(2.0)

@@ -1,0 +1,303 @@
+"""Runs as the runner hands them to the report, made up from statics: no simulation, no solver."""
+
+import copy
+import math
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+K = np.diag([1.0, 1.0, 0.0448]) @ np.array(
+    [[2208.96, -143.31, 399.86], [-143.31, 1875.92, -313.57], [399.86, -313.57, 1608.49]]
+) @ np.diag([1.0, 1.0, 0.0448])  # fmt: skip
+BOX = np.array([[-0.025, -0.07345], [0.025, -0.07345], [0.025, 0.07345], [-0.025, 0.07345]])
+HBOX = np.array([[-0.06, -0.03], [0.06, -0.03], [0.06, 0.03], [-0.06, 0.03]])
+GRASP = np.array([0.0, 0.045, 0.0])
+WEIGHT = 0.1 * 9.81
+RATE = 25.0
+
+
+def rotation(angle):
+    return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+
+
+def compose(a, b):
+    return np.array([*(a[:2] + rotation(a[2]) @ b[:2]), a[2] + b[2]])
+
+
+def balance(angle, corner, force, loaded=1.0):
+    """go, ee and wrench of a box held at ``angle`` with its lower left corner at ``corner`` under ``force`` [N]."""
+    go = np.array([*(corner - rotation(angle) @ BOX[0]), angle])
+    gocf = compose(go, GRASP)
+    arm_c, arm_g = corner - gocf[:2], go[:2] - gocf[:2]
+    f = -force - np.array([0.0, -WEIGHT])
+    torque = -(arm_c[0] * force[1] - arm_c[1] * force[0]) + arm_g[0] * WEIGHT
+    wrench = np.array([*f, torque])
+    local = np.array([*(rotation(angle).T @ f), torque])
+    return go, compose(gocf, loaded * np.linalg.solve(K, local)), wrench
+
+
+def contact(name, point, force, mode):
+    return {"name": name, "point": list(point), "normal": [0.0, 1.0], "force": list(force), "mode": mode}
+
+
+def build_trial(controller="closed_loop", eo=False, steps=20, seed=0, error=1.0, offset=0.0, status="completed"):
+    """A pivot from 10° to 35° under 4 N: ``error`` scales what is measured beside the plan."""
+    rng = np.random.default_rng(seed)
+    height = 0.06 if eo else 0.0
+    corner, force = np.array([0.01, height]), np.array([0.35, 4.0])
+    pose_eo = np.array([0.02, 0.03, 0.0])
+    angles = np.radians(np.linspace(10.0, 35.0, steps))
+    times = 5.0 + 0.6 * np.arange(steps)
+    planned = {"ee": [], "go": [], "eo": [] if eo else None, "wrench": []}
+    contacts = []
+    for angle in angles:
+        go, ee, wrench = balance(angle, corner, force)
+        for key, value in (("ee", ee), ("go", go), ("wrench", wrench)):
+            planned[key].append(value.tolist())
+        here = [contact("corner", corner, force, "stick")]
+        if eo:
+            planned["eo"].append(pose_eo.tolist())
+            here += [contact(f"ground {i}", (x, 0.0), (0.2, 3.0), "slip+") for i, x in enumerate((-0.04, 0.08))]
+        contacts.append(here)
+
+    def disturbed(scale, bias):
+        out = {}
+        for key, rows in planned.items():
+            if rows is None:
+                out[key] = None
+                continue
+            sigma = np.array([0.06, 0.09, 18e-3] if key == "wrench" else [8e-5, 1e-4, 1e-3])
+            noise = rng.normal(size=(steps, 3)) * sigma * scale
+            drift = np.array([3.5, -2.0, 0.9]) * sigma * bias
+            out[key] = (np.array(rows) + noise + drift).tolist()
+        return out
+
+    truth = disturbed(0.4 * error, error)
+    measured = disturbed(error, error)
+
+    t, phase, frames = [], [], {"ee": [], "go": [], "eo": [] if eo else None, "wrench": [], "contacts": []}
+    end = times[-1] + 4.0
+    for instant in np.arange(0.0, end, 1 / RATE):
+        angle = np.interp(instant, times, angles)
+        lift = 0.03 * max(0.0, 1 - instant / 2.5) + 0.05 * max(0.0, (instant - times[-1] - 2.0) / 2.0)
+        load = float(np.clip(min((instant - 2.6) / 2.0, (times[-1] + 1.8 - instant) / 1.5), 0.0, 1.0))
+        begins = {
+            "approach": 0.0,
+            "preload": 2.6,
+            "trajectory": 4.8,
+            "unload": times[-1] + 0.3,
+            "retreat": times[-1] + 2,
+        }
+        name = [label for label, begin in begins.items() if begin <= instant][-1]
+        go, ee, wrench = balance(angle, corner + np.array([0.0, lift]), load * force)
+        sway = 3e-4 * error * math.sin(3 * instant) * np.array([1.0, 0.0, 2.0])
+        frames["go"].append((go + sway).tolist())
+        frames["ee"].append((ee + sway).tolist())
+        frames["wrench"].append(wrench.tolist())
+        touching = load > 0
+        here = [contact("", corner, load * force, "stick")] if touching else []
+        if eo:
+            frames["eo"].append((pose_eo + np.array([offset * load, 0.0, 0.0])).tolist())
+            here += [contact("", (x, 0.0), (0.2 * load, 2.4 + 0.6 * load), "slip+") for x in (-0.04, 0.08)]
+        frames["contacts"].append(here)
+        t.append(float(instant))
+        phase.append(name)
+
+    skill = "relative_pivoting" if eo else "grasped_pivoting"
+    return {
+        "name": f"{skill}-{controller}",
+        "skill": skill,
+        "controller": controller,
+        "status": status,
+        "reason": "" if status == "completed" else "no way-point settled within 3.0 s at way-point 14",
+        "waypoints": {
+            "t": times.tolist(),
+            "planned": planned,
+            "measured": measured,
+            "truth": truth,
+            "contacts": contacts,
+        },
+        "playback": {"t": t, **frames, "source": "truth", "phase": phase},
+    }
+
+
+def errors(trial, source):
+    """M of results.json for a made-up trial, by the definition of design §6."""
+    planned, found = trial["waypoints"]["planned"], trial["waypoints"][source]
+    d = {
+        key: np.array(found[key]) - np.array(planned[key]) for key in ("go", "eo", "wrench") if planned[key] is not None
+    }
+    rho = 0.0448
+    own = d["eo"] if "eo" in d else d["go"]
+
+    def stat(values):
+        return {"mean": float(np.mean(values)), "std": float(np.std(values))}
+
+    def norm(rows, factor):
+        return stat(np.linalg.norm(rows * factor, axis=1))
+
+    pose_mm = 1e3 * np.array([1, 1, rho])
+    out = {"go_pose_mm": norm(d["go"], pose_mm), "wrench_N": norm(d["wrench"], np.array([1, 1, 1 / rho]))}
+    if "eo" in d:
+        out["eo_pose_mm"] = norm(d["eo"], pose_mm)
+    for key, column, rows, factor in (
+        ("fx_N", 0, d["wrench"], 1), ("fy_N", 1, d["wrench"], 1), ("tau_Nmm", 2, d["wrench"], 1e3),
+        ("x_mm", 0, own, 1e3), ("y_mm", 1, own, 1e3), ("theta_deg", 2, own, 180 / math.pi),
+    ):  # fmt: skip
+        out[key] = stat(np.abs(rows[:, column] * factor))
+    return out
+
+
+def build_run(trials, status="completed", eo=False):
+    rows = [
+        {
+            **{key: trial[key] for key in ("name", "skill", "controller", "status", "reason")},
+            "planner": "gradient", "grasped_object": "tall_box", "extrinsic_object": "hbox" if eo else None,
+            "sensor": "soft_bubble", "trial": index,
+            "measured": errors(trial, "measured"), "truth": errors(trial, "truth"),
+        }
+        for index, trial in enumerate(trials)
+    ]  # fmt: skip
+    return {
+        "results": {
+            "schema": 1, "status": status, "experiment": "grasped_pivoting", "station": "sim", "seed": 7,
+            "profile": "ideal",
+            "provenance": {
+                "git": {"commit": "25914cc0a7d2f3b1c9e8", "dirty": False},
+                "versions": {"extrinsic": "0.1.0", "mujoco": "4.0.0", "numpy": "2.4.6", "python": "3.11.9"},
+                "host": {"name": "bench-2", "cpu": "2 cores"},
+            },
+            "calibration": {"stiffness": K.tolist(), "friction": {"go-ground": 0.33}},
+            "plans": [{"name": "pivot", "skill": trials[0]["skill"], "planner": "gradient", "steps": 20, "queries": 100,
+                       "time_s": 7.19, "loss": 0.00231, "status": "optimal"}] if trials else [],
+            "trials": rows, "tables": [],
+        },
+        "title": "Grasped pivoting, 10° to 35° under 4 N",
+        "created": "2025-11-22T01:40:00Z",
+        "objects": {
+            "go": {"name": "tall_box", "vertices": BOX.tolist()},
+            "eo": {"name": "hbox", "vertices": HBOX.tolist()} if eo else None,
+        },
+        "grasp": GRASP.tolist(),
+        "trials": trials,
+        "log": {"file": "log.mcap", "bytes": 4_812_345, "lost": 0, "seconds": 41.6,
+                "messages": {"sim/arm/pose": 4160, "sim/wrist/wrench": 41600, "sim/camera/detections": 416}},
+        "events": [
+            {"t": 0.0, "level": "info", "text": "run started"},
+            {"t": 12.4, "level": "warning", "text": "closed_loop: correction reached its limit of 4 mm"},
+            {"t": 41.6, "level": "info", "text": "run completed"},
+        ],
+        "paper": None,
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def grasped():
+    """Two completed trials of grasped pivoting, with truth."""
+    return build_run([build_trial("open_loop", seed=1, error=3.0), build_trial("closed_loop", seed=2)])
+
+
+@pytest.fixture(scope="session")
+def extrinsic():
+    """One completed trial on an extrinsic object, and one that lost its contact; with figures of the paper beside."""
+    good, bad = (
+        build_trial(eo=True, offset=0.002),
+        build_trial("open_loop", eo=True, offset=0.004, status="lost_contact", seed=3, error=4),
+    )
+    run = build_run([good, bad], status="completed", eo=True)
+    figures = {"go_pose_mm": {"mean": 1.26, "std": 0.98}, "eo_pose_mm": {"mean": 0.31, "std": 0.32}}
+    run["paper"] = {"source": "Table 2", "rows": {good["name"]: figures}}
+    return run
+
+
+@pytest.fixture(scope="session")
+def aborted():
+    """A run that a device ended at way-point 6: no truth, holes in what was measured, a log that was cut off."""
+    trial = build_trial(status="device_failed", seed=4)
+    way = trial["waypoints"]
+    way["t"] = way["t"][:6]
+    way["measured"] = {k: None if v is None else v[:5] + [None] * 15 for k, v in way["measured"].items()}
+    way["measured"]["wrench"][2] = [float("nan")] * 3
+    way["truth"] = None
+    cut = 200
+    trial["playback"] = {k: v[:cut] if isinstance(v, list) else v for k, v in trial["playback"].items()}
+    trial["playback"]["source"] = "estimate"
+    trial["playback"]["wrench"][150:160] = [None] * 10
+    trial["reason"] = "arm: read: no reading within 1 s"
+    run = build_run([build_trial()], status="device_failed")
+    row = run["results"]["trials"][0]
+    row.update(status="device_failed", reason=trial["reason"], measured=None, truth=None)
+    run["trials"] = [trial]
+    run["results"]["reason"] = "arm: read: no reading within 1 s. Check `extrinsic status STATION`"
+    run["log"].update(lost=12, torn=True)
+    run["events"].append({"t": 8.0, "level": "error", "text": "arm: read: no reading within 1 s"})
+    return run
+
+
+@pytest.fixture
+def empty():
+    """What is left of a run that died before its first trial."""
+    return {
+        "results": {"schema": 1, "status": "stopped", "experiment": "grasped_static", "trials": [], "provenance": {}},
+        "title": "Grasped static", "created": "2025-11-22T01:40:00Z", "objects": {"go": None, "eo": None},
+        "grasp": [0, 0, 0], "trials": [], "log": None, "events": [], "paper": None,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def editable(grasped):
+    """A copy of the grasped run that a test may change."""
+    return copy.deepcopy(grasped)
+
+
+class Cells(HTMLParser):
+    """Texts of the body cells, row by row, of the table with the given id."""
+
+    def __init__(self, table):
+        super().__init__()
+        self.table, self.inside, self.cell, self.rows = table, False, False, []
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "table":
+            self.inside = dict(attrs).get("id") == self.table
+        elif self.inside and tag == "tr":
+            self.rows.append([])
+        elif self.inside and tag in ("td", "th"):
+            self.cell = True
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag):
+        if tag in ("td", "th"):
+            self.cell = False
+        elif tag == "table":
+            self.inside = False
+
+    def handle_data(self, data):
+        if self.inside and self.cell:
+            self.rows[-1][-1] += data
+
+
+@pytest.fixture(scope="session")
+def find_cells():
+    """The function (page, table id) → texts of the rows below the head."""
+
+    def find(page, table):
+        parser = Cells(table)
+        parser.feed(page)
+        head = 2 if table == "errors" else 1
+        return [[" ".join(cell.split()) for cell in row] for row in parser.rows[head:]]
+
+    return find
+
+
+@pytest.fixture(scope="session")
+def make_trial():
+    """The function that makes up a trial."""
+    return build_trial
+
+
+@pytest.fixture(scope="session")
+def make_run():
+    """The function that puts trials into a run."""
+    return build_run

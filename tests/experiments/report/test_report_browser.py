@@ -1,0 +1,363 @@
+"""The page in a browser: it is quiet, it asks for nothing, it moves, and what it shows are the numbers it was given."""
+
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.report import render
+
+CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
+RUNS = ("grasped", "extrinsic", "aborted", "empty")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if not Path(CHROMIUM).exists():
+        pytest.skip("no chromium at /usr/bin/chromium; on Debian: apt-get install chromium")
+    arguments = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def show(browser, tmp_path_factory):
+    """Open the report of a run from disk, off line; what it complains of and asks for is in ``page.heard``."""
+    contexts = []
+
+    def open_report(run, width=1280, scheme="light"):
+        path = tmp_path_factory.mktemp("report") / "report.html"
+        path.write_text(render(run), encoding="utf-8")
+        context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, offline=True)
+        context.set_default_timeout(30_000)
+        contexts.append(context)
+        page = context.new_page()
+        page.heard = []
+        page.on("console", lambda message: page.heard.append(f"{message.type}: {message.text}"))
+        page.on("pageerror", lambda error: page.heard.append(f"error: {error}"))
+        page.on("request", lambda request: request.url == path.as_uri() or page.heard.append(f"request: {request.url}"))
+        page.goto(path.as_uri())
+        return page
+
+    yield open_report
+    for context in contexts:
+        context.close()
+
+
+@pytest.fixture(scope="module")
+def page(show, grasped):
+    return show(grasped)
+
+
+def seek(page, t):
+    """Move the slider as a hand would: set it and let it tell."""
+    page.locator("#time").evaluate("(slider, t) => { slider.value = t; slider.dispatchEvent(new Event('input')); }", t)
+
+
+def draw_traces(page):
+    page.locator("#traces-title").scroll_into_view_if_needed()
+    page.wait_for_selector("#traces .scatterlayer .trace")
+
+
+def wait_until(page, condition):
+    """Wait for a condition on the page, looked at once per frame."""
+    page.evaluate(
+        f"new Promise((done) => {{ const look = () => ({condition}) ? done() : requestAnimationFrame(look); look(); }})"
+    )
+
+
+def pose(page, body):
+    """[x, y, θ in degrees] of a drawn body, and None where it is not shown."""
+    node = page.locator(f".body-{body}")
+    if not node.is_visible():
+        return None
+    text = node.get_attribute("transform")
+    return [
+        float(v) for part in text.replace(")", "").split(" rotate(") for v in part.replace("translate(", "").split()
+    ]
+
+
+def expect_pose(page, body, wanted):
+    assert pose(page, body) == pytest.approx([wanted[0], wanted[1], math.degrees(wanted[2])], abs=1e-4)
+
+
+@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (800, "dark")])
+def test_the_page_is_quiet_asks_for_nothing_and_fits(request, show, name, width, scheme):
+    page = show(request.getfixturevalue(name), width, scheme)
+    if name != "empty":
+        draw_traces(page)
+        page.locator("#play").click()
+        wait_until(page, "Player.time > 5.05")
+        page.locator("#play").click()
+    for i in range(page.locator("details").count()):
+        page.locator("details summary").nth(i).click()
+    assert page.heard == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    for table in page.locator(".scroll").all():
+        assert table.evaluate("box => box.scrollWidth - box.clientWidth") <= 1, table.inner_text()
+
+
+def test_the_slider_moves_the_scene(page, grasped):
+    playback = grasped["trials"][0]["playback"]
+    for index in (0, 70, 200, len(playback["t"]) - 1):
+        seek(page, playback["t"][index])
+        expect_pose(page, "go", playback["go"][index])
+        expect_pose(page, "ee", playback["ee"][index])
+
+
+def test_between_two_frames_the_pose_lies_between(page, grasped):
+    playback = grasped["trials"][0]["playback"]
+    seek(page, (playback["t"][200] + playback["t"][201]) / 2)
+    expect_pose(page, "go", (np.array(playback["go"][200]) + np.array(playback["go"][201])) / 2)
+
+
+def test_error_table_on_screen_equals_the_results(page, grasped):
+    for row, trial in zip(page.locator("#errors tbody tr").all(), grasped["results"]["trials"], strict=True):
+        shown = [cell.inner_text() for cell in row.locator("td.number").all()]
+        means = [trial[s][k]["mean"] for k in ("go_pose_mm", "wrench_N") for s in ("measured", "truth")]
+        stds = [trial[s][k]["std"] for k in ("go_pose_mm", "wrench_N") for s in ("measured", "truth")]
+        assert shown == [f"{mean:.3f} ± {std:.3f}" for mean, std in zip(means, stds, strict=True)]
+
+
+def test_read_out_gives_the_way_point_in_the_units_of_the_paper(page, grasped):
+    way = grasped["trials"][0]["waypoints"]
+    seek(page, way["t"][7])
+    rows = {}
+    series = ""
+    for row in page.locator("#values tbody tr").all():
+        heads = [head.inner_text() for head in row.locator("th").all()]
+        series = heads[0] or series
+        rows[series, heads[1]] = [float(c.inner_text().replace("−", "-")) for c in row.locator("td").all()]
+    for column, source in enumerate(("planned", "measured", "truth"), start=1):
+        x, y, theta = way[source]["go"][7]
+        assert rows["go", "x [mm]"][column] == pytest.approx(x * 1e3, abs=0.006)
+        assert rows["go", "y [mm]"][column] == pytest.approx(y * 1e3, abs=0.006)
+        assert rows["go", "θ [deg]"][column] == pytest.approx(math.degrees(theta), abs=0.006)
+        fx, fy, tau = way[source]["wrench"][7]
+        assert rows["wrench", "fx [N]"][column] == pytest.approx(fx, abs=0.0006)
+        assert rows["wrench", "fy [N]"][column] == pytest.approx(fy, abs=0.0006)
+        assert rows["wrench", "τ [N·mm]"][column] == pytest.approx(tau * 1e3, abs=0.06)
+
+
+def test_compliance_is_the_pose_of_ee_in_gocf(page, grasped):
+    playback, grasp = grasped["trials"][0]["playback"], np.array(grasped["grasp"])
+    seek(page, playback["t"][220])
+    go, ee = np.array(playback["go"][220]), np.array(playback["ee"][220])
+    c, s = math.cos(go[2]), math.sin(go[2])
+    R = np.array([[c, -s], [s, c]])
+    x, y = R.T @ (ee[:2] - (go[:2] + R @ grasp[:2])) * 1e3
+    shown = page.locator("#offset").text_content().replace("−", "-")
+    assert shown == f"x {x:.2f} mm · y {y:.2f} mm · θ {math.degrees(ee[2] - go[2]):.2f}°"
+
+
+def test_the_ghost_is_the_plan_at_the_way_point_under_way(page, grasped):
+    way = grasped["trials"][0]["waypoints"]
+    seek(page, way["t"][4] + 0.2)
+    shown = page.locator(".ghost-go").get_attribute("transform")
+    x, y, _ = way["planned"]["go"][5]
+    assert [float(v) for v in shown[len("translate(") : shown.index(")")].split()] == pytest.approx([x, y], abs=1e-6)
+    page.locator("#show-plan").uncheck()
+    assert not page.locator(".ghost-go").is_visible()
+    page.locator("#show-plan").check()
+    assert page.locator(".ghost-go").is_visible()
+
+
+def colour(node):
+    return [int(v) for v in node.evaluate("n => getComputedStyle(n).fill").removeprefix("rgb(").rstrip(")").split(",")]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_sticking_is_red_and_round_slipping_green_and_square(show, extrinsic, scheme):
+    page = show(extrinsic, scheme=scheme)
+    seek(page, 8.0)
+    stick, slip = page.locator("#scene .mode-stick"), page.locator("#scene .mode-slip")
+    assert (stick.count(), slip.count()) == (1, 2)
+    red, green = colour(stick.first), colour(slip.first)
+    assert red[0] > 2 * max(red[1:])
+    assert green[1] > 1.5 * max(green[0], green[2])
+    assert "A" in stick.first.get_attribute("d")
+    assert "A" not in slip.first.get_attribute("d")
+    assert page.locator("#contacts li").all_inner_texts()[1:] == ["slip+, 3.01 N"] * 2
+
+
+def test_contact_markers_and_force_arrows_are_where_the_contacts_are(show, extrinsic):
+    page = show(extrinsic)
+    seek(page, 8.0)
+    found = page.evaluate(
+        """() => {
+          const numbers = (text) => text.match(/-?[\\d.]+/g).map(Number);
+          const all = (selector) => [...document.querySelectorAll(`#scene ${selector}`)];
+          return {
+            marks: all(".marker").map((node) => numbers(node.getAttribute("transform"))),
+            arrows: all(".arrow.contact").map((node) => numbers(node.getAttribute("d"))),
+            ground: all(".ground")[0].getBBox().y,
+            perMm: all(".scale")[0].getBBox().width / numbers(all(".quiet")[0].textContent)[0],
+          };
+        }"""
+    )
+    contacts = extrinsic["trials"][0]["playback"]["contacts"][200]
+    marks = np.array(found["marks"])
+    points = np.array([c["point"] for c in contacts]) * 1e3
+    np.testing.assert_allclose((found["ground"] - marks[:, 1]) / found["perMm"], points[:, 1], atol=0.1)
+    np.testing.assert_allclose(np.diff(marks[:, 0]) / found["perMm"], np.diff(points[:, 0]), atol=0.1)
+    for contact, mark, outline in zip(contacts, marks, found["arrows"], strict=True):
+        tip = np.array(outline[6:8]) - mark
+        fx, fy = contact["force"]
+        assert math.atan2(-tip[1], tip[0]) == pytest.approx(math.atan2(fy, fx), abs=0.01)
+    lengths = [np.hypot(*(np.array(o[6:8]) - m)) for o, m in zip(found["arrows"], marks, strict=True)]
+    forces = [np.hypot(*c["force"]) for c in contacts]
+    assert lengths[0] / lengths[1] == pytest.approx(forces[0] / forces[1], rel=0.01)
+
+
+def test_keys_step_through_the_way_points_and_play(show, grasped):
+    page = show(grasped)
+    times = grasped["trials"][0]["waypoints"]["t"]
+    now = lambda: page.evaluate("Player.time")  # noqa: E731
+    assert now() == pytest.approx(times[0])
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    assert now() == pytest.approx(times[2], abs=1e-5)
+    page.keyboard.press("ArrowLeft")
+    assert now() == pytest.approx(times[1], abs=1e-5)
+    page.keyboard.press(".")
+    assert now() == pytest.approx(times[1] + 0.04, abs=0.04)
+    page.keyboard.press("End")
+    assert now() == pytest.approx(grasped["trials"][0]["playback"]["t"][-1], abs=1e-5)
+    page.keyboard.press("Home")
+    assert now() == 0
+    page.keyboard.press("Space")
+    assert page.locator("#play").inner_text() == "Pause"
+    wait_until(page, "Player.time > 0.2")
+    page.keyboard.press("Space")
+    assert page.locator("#play").inner_text() == "Play"
+    stopped = now()
+    page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    assert now() == stopped
+
+
+def test_playing_ends_at_the_end_and_begins_anew(show, grasped):
+    page = show(grasped)
+    end = grasped["trials"][0]["playback"]["t"][-1]
+    seek(page, end - 0.1)
+    page.locator("#play").click()
+    wait_until(page, "document.getElementById('play').textContent === 'Play'")
+    assert page.evaluate("Player.time") == pytest.approx(end, abs=1e-6)
+    page.locator("#play").click()
+    wait_until(page, f"Player.time > 0 && Player.time < {end - 1}")
+
+
+def test_the_trial_selector_changes_scene_and_traces(show, grasped):
+    page = show(grasped)
+    draw_traces(page)
+    page.locator("#trial").select_option("1")
+    seek(page, 8.0)
+    playback = grasped["trials"][1]["playback"]
+    expect_pose(page, "go", playback["go"][200])
+    assert "closed loop" in page.locator("#trial-facts").inner_text()
+    shown = page.evaluate("document.getElementById('traces').data.find(t => t.meta.role === 'measured').y")
+    expected = [row[0] * 1e3 for row in grasped["trials"][1]["waypoints"]["measured"]["go"]]
+    assert shown == pytest.approx(expected, abs=1e-3)
+
+
+def test_traces_show_values_and_deviations_from_the_plan(show, grasped):
+    page = show(grasped)
+    draw_traces(page)
+    way = grasped["trials"][0]["waypoints"]
+    find = """(role) => {
+        const wanted = (m) => m.role === role && m.series === 'wrench' && m.component === 2;
+        const trace = document.getElementById('traces').data.find((t) => wanted(t.meta));
+        return [trace.x, trace.y];
+    }"""
+    for role in ("planned", "measured", "truth"):
+        x, y = page.evaluate(find, role)
+        assert x == pytest.approx(way["t"], abs=1e-5)
+        assert y == pytest.approx([w[2] * 1e3 for w in way[role]["wrench"]], abs=1e-2)
+    page.get_by_label("deviation from the plan").check()
+    _, y = page.evaluate(find, "measured")
+    deviation = [(m[2] - p[2]) * 1e3 for m, p in zip(way["measured"]["wrench"], way["planned"]["wrench"], strict=True)]
+    assert y == pytest.approx(deviation, abs=1e-2)
+    assert page.heard == []
+
+
+def test_the_cursor_in_the_traces_follows_the_playback(show, grasped):
+    page = show(grasped)
+    draw_traces(page)
+    left = lambda: page.locator("#traces .cursor").first.evaluate("n => parseFloat(n.style.left)")  # noqa: E731
+    positions = []
+    for t in (6.0, 10.0, 14.0):
+        seek(page, t)
+        positions.append(left())
+    assert positions[2] - positions[1] == pytest.approx(positions[1] - positions[0], rel=0.01)
+    assert positions[1] - positions[0] > 20
+    seek(page, 0.0)
+    assert not page.locator("#traces .cursor").first.is_visible()
+
+
+def test_dark_scheme_reaches_the_plots(show, grasped):
+    page = show(grasped, scheme="light")
+    draw_traces(page)
+    assert page.evaluate("document.getElementById('traces').layout.paper_bgcolor") == "#ffffff"
+    page.emulate_media(color_scheme="dark")
+    wait_until(page, "document.getElementById('traces').layout.paper_bgcolor === '#14171a'")
+
+
+def test_on_paper_everything_is_open_light_and_plotted(show, grasped):
+    page = show(grasped, scheme="dark")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    assert page.locator("details:not([open])").count() == 0
+    assert page.locator("#traces .scatterlayer .trace").count() > 0
+    page.emulate_media(media="print", color_scheme="dark")
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    assert not page.locator("#play").is_visible()
+    page.emulate_media(media="screen")
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert page.locator("details[open]").count() == 0
+    assert page.heard == []
+
+
+def test_a_trial_without_anything_recorded_says_so(show, editable):
+    editable["trials"][0].update(waypoints=None, playback=None)
+    page = show(editable)
+    assert page.locator("#no-playback").is_visible()
+    assert not page.locator("#stage").is_visible()
+    page.locator("#trial").select_option("1")
+    assert page.locator("#stage").is_visible()
+    draw_traces(page)
+    page.locator("#trial").select_option("0")
+    assert page.locator("#no-traces").is_visible()
+    assert page.heard == []
+
+
+def test_holes_in_a_recording_hide_the_body_instead_of_inventing_a_pose(show, editable):
+    playback = editable["trials"][0]["playback"]
+    for index in (100, 101):
+        playback["go"][index] = None
+        playback["ee"][index] = [math.nan, 0.0, 0.0]
+    page = show(editable)
+    seek(page, playback["t"][100])
+    assert pose(page, "go") is None
+    assert pose(page, "ee") is None
+    assert page.locator("#offset").text_content() == "not recorded"
+    seek(page, playback["t"][99])
+    assert pose(page, "go") is not None
+    assert page.heard == []
+
+
+def test_hostile_names_are_shown_not_obeyed(show, editable):
+    name = "</script><script>window.harmed = 1</script><img src=x onerror='window.harmed = 1'>"
+    for trial in (*editable["trials"], *editable["results"]["trials"]):
+        trial.update(name=name, reason=name, skill=name)
+    editable["trials"][0]["playback"]["phase"] = [name] * len(editable["trials"][0]["playback"]["t"])
+    editable["trials"][0]["waypoints"]["contacts"][0][0]["name"] = name
+    page = show(editable)
+    draw_traces(page)
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("window.harmed") is None
+    assert name in page.locator("#errors tbody th").first.text_content()
+    assert page.heard == []

@@ -1,0 +1,107 @@
+"""One experiment, from YAML to report, through the simulated station over zenoh."""
+
+import json
+import re
+
+import pytest
+from mcap.reader import make_reader
+
+SKILLS = ("grasped_static", "grasped_pivoting")
+
+
+@pytest.fixture(scope="module", params=SKILLS)
+def ideal(request, shared_command):
+    """The shipped experiment as it is, on the ideal station."""
+    return shared_command.run(request.param, "--set", "world.profile=ideal", out=request.param)
+
+
+@pytest.fixture(scope="module", params=SKILLS)
+def softer(request, shared_command):
+    """The same on a plant a fifth softer than the planner believes."""
+    return shared_command.run(request.param, "--set", "world.stiffness_scale=0.8", out=f"{request.param}-softer")
+
+
+def without_times_and_provenance(results):
+    kept = {key: value for key, value in results.items() if key not in ("provenance", "started", "finished")}
+    return kept | {"plans": [{k: v for k, v in plan.items() if k != "time_s"} for plan in results["plans"]]}
+
+
+def test_the_run_is_done_and_ends_with_the_reports_path(ideal):
+    assert ideal.code == 0, ideal.err
+    assert ideal.results["status"] == "completed"
+    path = re.search(r"report: (\S+)", ideal.out.splitlines()[-1])[1]
+    assert (ideal.folder.parent / path).read_text().lower().startswith("<!doctype html>")
+
+
+def test_open_loop_on_the_ideal_plant_is_true_to_a_fiftieth(ideal):
+    truth = ideal.trial("open_loop")["truth"]
+    assert truth["go_pose_mm"]["mean"] <= 0.02
+    assert truth["wrench_N"]["mean"] <= 0.02
+
+
+def test_measured_figures_stand_beside_the_truth(ideal):
+    for trial in ideal.results["trials"]:
+        for figure in ("go_pose_mm", "wrench_N", "fx_N", "fy_N", "tau_Nmm", "x_mm", "y_mm", "theta_deg"):
+            assert trial["measured"][figure]["mean"] >= 0 and trial["truth"][figure]["mean"] >= 0
+
+
+def test_closed_loop_brings_the_wrench_error_of_a_softer_plant_below_a_fifth(softer):
+    open_loop, closed_loop = softer.trial("open_loop"), softer.trial("closed_loop")
+    assert open_loop["truth"]["wrench_N"]["mean"] > 0.3  # a fifth of several newtons is missing
+    assert closed_loop["truth"]["wrench_N"]["mean"] < open_loop["truth"]["wrench_N"]["mean"] / 5
+
+
+def test_the_run_folder_holds_what_the_contract_says(ideal):
+    assert {"experiment.yaml", "log.mcap", "results.json", "report.html"} <= {p.name for p in ideal.folder.iterdir()}
+    results = ideal.results
+    assert results["schema"] == 1 and results["seed"] == 0 and results["station"] == "sim"
+    assert {"git", "versions", "host"} == set(results["provenance"])
+
+
+def test_every_published_message_was_logged(ideal):
+    account = ideal.results["log"]
+    assert account["lost"] == 0
+    assert account["published"]["sim/wrist_ft/wrench"] > 1000
+    with (ideal.folder / "log.mcap").open("rb") as file:
+        statistics = make_reader(file).get_summary().statistics
+        channels = {c.topic: c.id for c in make_reader(file).get_summary().channels.values()}
+    for topic, count in account["published"].items():
+        assert statistics.channel_message_counts[channels[topic]] == count, topic
+
+
+def test_the_same_seed_gives_the_same_results(ideal, shared_command):
+    again = shared_command.run(
+        ideal.results["experiment"], "--set", "world.profile=ideal", out=f"{ideal.folder.name}-2"
+    )
+    assert without_times_and_provenance(again.results) == without_times_and_provenance(ideal.results)
+
+
+def test_the_resolved_experiment_runs_again_to_the_same_results(ideal, shared_command):
+    again = shared_command.run(str(ideal.folder / "experiment.yaml"), out=f"{ideal.folder.name}-3")
+    assert again.code == 0, again.err
+    assert without_times_and_provenance(again.results) == without_times_and_provenance(ideal.results)
+
+
+def test_a_run_that_joins_a_served_station_sees_the_same_truth(ideal, command):
+    host = command.start("serve", "sim", "--set", f"bus.endpoint={command.endpoint}")
+    assert "serving" in host.stderr.readline()
+    joined = command.run(ideal.results["experiment"])
+    assert joined.code == 0, joined.err
+    assert host.poll() is None  # a joined host outlives the run
+    assert [t["truth"] for t in joined.results["trials"]] == [t["truth"] for t in ideal.results["trials"]]
+
+
+def test_the_report_is_rebuilt_from_the_log(ideal, shared_command):
+    report = ideal.folder / "report.html"
+    before = report.read_text()
+    report.unlink()
+    finished = shared_command.finish(shared_command.start("report", str(ideal.folder)))
+    assert finished.code == 0, finished.err
+    assert report.read_text() == before
+
+
+def test_events_are_lines_of_json(softer):
+    path = softer.folder / "events.jsonl"
+    if path.exists():
+        for line in path.read_text().splitlines():
+            assert {"t_ns", "level", "text"} == set(json.loads(line))

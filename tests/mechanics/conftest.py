@@ -1,0 +1,6 @@
+"""Examples of a property may take as long as they take: the machine that runs them has other work."""
+
+from hypothesis import HealthCheck, settings
+
+settings.register_profile("steady", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("steady")
