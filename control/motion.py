@@ -19,20 +19,31 @@ def quintic(s: float) -> tuple[float, float]:
 class Mover:
     """Sends set-points at ``rate`` [Hz]; every motion starts where the last one ended."""
 
-    def __init__(self, arm: Arm, clock: Clock, rate: float, start: Array, speed: float):
-        """``start`` (3,) is the present pose of the end-effector, ``speed`` [m/s] the mean speed of free motions."""
+    def __init__(
+        self,
+        arm: Arm,
+        clock: Clock,
+        rate: float,
+        start: Array,
+        speed: float,
+        tick: Callable[[], None] = lambda: None,
+    ):
+        """``start`` (3,) is the present pose of the end-effector, ``speed`` [m/s] the mean speed of free motions.
+
+        ``tick`` is called after each set-point.
+        """
         self.pose = np.asarray(start, float)
         self.speed = speed
         self._arm, self._clock, self._period = arm, clock, 1.0 / rate
         self._sequence = 0
-        self.on_tick: Callable[[Array], None] = lambda _pose: None
+        self._tick = tick
 
     def _send(self, pose: Array, twist: Array) -> None:
         self._sequence += 1
         self._arm.command(ArmTarget(pose, twist, self._period, self._sequence))
         self.pose = pose
-        self.on_tick(pose)
         self._clock.sleep(self._period)
+        self._tick()
 
     def ramp(self, goal: Array, seconds: float) -> None:
         """Move to ``goal`` (3,) along a straight line in (x, y, θ) with a quintic time law, taking ``seconds``."""

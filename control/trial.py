@@ -41,6 +41,8 @@ class Watch:
     waypoint: Callable[[WaypointRecord], None] = lambda _waypoint: None
     phase: Callable[[str, float], None] = lambda _name, _fraction: None
     event: Callable[[str, str], None] = lambda _level, _text: None
+    #: once per set-point; whatever it raises ends the trial
+    tick: Callable[[], None] = lambda: None
     #: asks a person to reset the scene and says whether they did; a station without a person answers False
     reset_scene: Callable[[str], bool] = lambda _what: False
 
@@ -70,7 +72,7 @@ class Trial:
         self._settings, self._watch = settings, watch
         self._result = TrialResult("completed", "", plan)
         self._mover = Mover(
-            observer.arm, clock, settings.control_rate, observer.arm.latest().pose, settings.approach_speed
+            observer.arm, clock, settings.control_rate, observer.arm.latest().pose, settings.approach_speed, watch.tick
         )
 
     def run(self) -> TrialResult:
@@ -112,6 +114,7 @@ class Trial:
         self._watch.phase("preload", 0.0)
         touch = controller.command(plan.preload_go[0], plan.preload_ee[0])
         mover.ramp(touch, s.clearance_mm * 1e-3 / s.touch_speed)
+        mover.rest(max(s.settle, 0.1))  # without a rest after touch-down the corner walks by 10 µm
         path = [controller.command(go, ee) for go, ee in zip(plan.preload_go, plan.preload_ee, strict=True)]
         mover.through(np.array(path), s.preload)
 
@@ -156,14 +159,13 @@ class Trial:
 
     def _anchored(self, go_expected: Array) -> Plan:
         """Verify the start by tags, zero the wrist sensor under the go's weight, and anchor the plan to the table."""
-        for attempt in range(2):
+        seen = self._observer.see(("table", "go"))
+        problem = self._start_problem(seen, go_expected)
+        if problem is not None and self._watch.reset_scene(problem):
             seen = self._observer.see(("table", "go"))
             problem = self._start_problem(seen, go_expected)
-            if problem is None:
-                break
-            self._watch.event("warning", problem)
-            if attempt or not self._watch.reset_scene(problem):
-                raise _Ended("stopped", f"the start could not be verified: {problem}")
+        if problem is not None:
+            raise _Ended("stopped", f"the start could not be verified: {problem}")
         table, go = seen["table"], seen["go"]
         assert table is not None and go is not None  # _start_problem saw both
         self._observer.zero(self._load, go.pose)

@@ -334,7 +334,10 @@ def _agree(config: StationConfig, said: dict) -> None:
             config.name, asked, f"it speaks protocol {said.get('protocol')}, not {_PROTOCOL}", "Restart it"
         )
     mine, theirs = config.model_dump(mode="json"), said["config"]
-    differing = [key for key in ("name", "world", "devices", "table_tags") if mine.get(key) != theirs.get(key)]
+    differing = [key for key in ("name", "devices", "table_tags") if mine.get(key) != theirs.get(key)]
+    # how far the plant is from the model goes with the reset; its time and its step were fixed when the host started
+    ours, its = mine.get("world") or {}, theirs.get("world") or {}
+    differing += [f"world.{key}" for key in ("clock", "timestep") if ours.get(key) != its.get(key)]
     if differing:
         raise NotConnected(
             config.name,

@@ -84,5 +84,3 @@ def _row(config: StationConfig, device: RemoteSensor, since_ns: int, seconds: fl
         gaps=device.gaps,
         note="; ".join(notes),
     )
-
-

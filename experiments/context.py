@@ -37,13 +37,14 @@ class RunContext:
         progress: Progress,
         closing: ExitStack,
         ask: Callable[[str], bool],
+        check_interrupt: Callable[[], None],
     ):
         self.resolved = resolved
         self.folder, self.results, self.log, self.progress = folder, results, log, progress
         self.settings: TrialSettings = resolved.experiment.trial
         self.plans: dict[str, Plan] = {}
         self.holder = f"run-{socket.gethostname()}-{os.getpid()}"
-        self.ask = ask
+        self.ask, self.check_interrupt = ask, check_interrupt
         self._closing = closing
         self._devices: Devices | None = None
 

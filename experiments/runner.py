@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,12 +18,15 @@ from experiments.check import check
 from experiments.context import RunContext
 from experiments.exit_codes import STATUS, ExitCode, of_trials
 from experiments.files import Resolved, dump_resolved
+from experiments.interrupt import Interrupt
 from experiments.progress import Progress
 from experiments.provenance import provenance
 from experiments.report.build import build_report
 from experiments.run_folder import RunFolder, write_atomic, write_json
 from experiments.stages import STAGES
 from planning.errors import InfeasiblePlan
+
+INTERRUPTED = "interrupted by the user"
 
 
 @dataclass(frozen=True)
@@ -59,13 +60,12 @@ def run(resolved: Resolved, out: Path | None = None, console: Console | None = N
         "trials": [],
         "tables": [],
     }
-    with interruptible() as end_quietly:
-        code, reason = ExitCode.DONE, ""
+    with Interrupt() as interrupt:
         try:
-            code, reason = _stages(resolved, folder, results, console, end_quietly)
+            code, reason = _stages(resolved, folder, results, console, interrupt)
         except KeyboardInterrupt:
-            code, reason = ExitCode.INTERRUPTED, "interrupted by the user"
-        end_quietly()
+            code, reason = ExitCode.INTERRUPTED, INTERRUPTED
+        interrupt.closing()
         results["status"], results["reason"] = STATUS[code], reason
         results["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
         outcome = Outcome(code, folder, results, reason)
@@ -78,7 +78,7 @@ def _stages(
     folder: RunFolder,
     results: dict[str, Any],
     console: Console,
-    closing_begins: Callable[[], None],
+    interrupt: Interrupt,
 ) -> tuple[ExitCode, str]:
     """Run all stages with log and station open, close both in order, and say how it ended."""
     progress = Progress(console)
@@ -86,11 +86,12 @@ def _stages(
     with ExitStack() as closing:
         log = closing.enter_context(LogWriter(folder.log, flush=resolved.station.log.flush))
         log.add_attachment("experiment.yaml", "application/yaml", folder.experiment.read_bytes())
-        context = RunContext(resolved, folder, results, log, progress, closing, _ask(console))
+        context = RunContext(resolved, folder, results, log, progress, closing, _ask(console), interrupt.check)
         context.save()
         try:
             for stage in resolved.experiment.stages:
                 STAGES[stage.stage](context, stage)
+                interrupt.check()
                 code, reason = of_trials(results["trials"])
                 if code in (ExitCode.DEVICE_FAILED, ExitCode.STOPPED):
                     break
@@ -101,8 +102,8 @@ def _stages(
         except DriverError as error:
             code, reason = ExitCode.DEVICE_FAILED, str(error)
         except KeyboardInterrupt:
-            code, reason = ExitCode.INTERRUPTED, "interrupted by the user"
-        closing_begins()
+            code, reason = ExitCode.INTERRUPTED, INTERRUPTED
+        interrupt.closing()
         if code in (ExitCode.INFEASIBLE, ExitCode.INTERRUPTED, ExitCode.DEVICE_FAILED):
             context.event("error", reason)
         results["log"] = _accounts(context, log)
@@ -141,29 +142,3 @@ def _ask(console: Console) -> Callable[[str], bool]:
         return sys.stdin.readline().strip().lower() != "q"
 
     return ask
-
-
-@contextmanager
-def interruptible() -> Iterator[Callable[[], None]]:
-    """SIGINT and SIGTERM raise KeyboardInterrupt once; after that, or once what is yielded was called, they only tell.
-
-    So closing cannot be cut short by a second Ctrl-C: the arm is held and the log is closed first.
-    """
-    closing = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield closing.set
-        return
-
-    def on_signal(_number: int, _frame: object) -> None:
-        if closing.is_set():
-            sys.stderr.write("closing: the arm is held and the log is being written\n")
-            return
-        closing.set()
-        raise KeyboardInterrupt
-
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield closing.set
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

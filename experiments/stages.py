@@ -13,6 +13,7 @@ import numpy as np
 from control.base import Controller
 from control.observe import Observer
 from control.trial import Trial, TrialResult, Watch
+from drivers.errors import DriverError
 from drivers.station import Devices
 from estimation.force_torque import WristSensor
 from experiments import registries, setup
@@ -78,13 +79,17 @@ def _one_trial(
 
         watch = Watch(
             waypoint=on_waypoint,
+            tick=context.check_interrupt,
             phase=lambda phase, _fraction: context.write(PhaseRecord(devices.clock.now_ns(), name, phase)),
             event=lambda level, text: context.event(level, f"{name}: {text}"),
             reset_scene=context.ask if devices.simulation is None else lambda _what: False,
         )
-        observer = _observer(context, devices)
         clock, load = devices.clock, setup.free_air_load(context.resolved)
-        result = Trial(name, plan, controller, observer, clock, load, context.settings, watch).run()
+        try:
+            observer = _observer(context, devices)
+            result = Trial(name, plan, controller, observer, clock, load, context.settings, watch).run()
+        except DriverError as error:  # before the protocol began
+            result = TrialResult("device_failed", str(error), plan)
     context.results["trials"].append(_row(context, name, controller.name, trial, result, waypoints))
     end = replace(begin, status=result.status, reason=result.reason, plan=json.dumps(result.plan.to_dict()))
     context.write(replace(end, capture_ns=context.now_ns()))

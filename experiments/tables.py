@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
@@ -13,22 +14,23 @@ from drivers.status import DeviceStatus
 
 def error_table(results: dict[str, Any]) -> Table:
     """Pose and wrench error of every trial, through the sensors and, in simulation, against the truth beside it."""
-    table = Table(
-        title=f"{results['experiment']} on {results['station']}, seed {results['seed']}", title_justify="left"
-    )
-    table.add_column("trial")
+    title = f"{results['experiment']} on {results['station']}, seed {results['seed']}"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("trial", overflow="fold")
     table.add_column("status")
-    simulated = any(trial["truth"] is not None for trial in results["trials"])
-    witnesses = ("measured", "truth") if simulated else ("measured",)
-    for witness in witnesses:
-        table.add_column(f"pose [mm]\n{witness}", justify="right")
-        table.add_column(f"wrench [N]\n{witness}", justify="right")
+    table.add_column("seen by")
+    table.add_column("pose [mm]", justify="right", no_wrap=True)
+    table.add_column("wrench [N]", justify="right", no_wrap=True)
     for trial in results["trials"]:
-        cells = [escape(trial["name"]), trial["status"]]
-        for witness in witnesses:
-            figures = trial[witness] or {}
-            cells += [_cell(figures.get("go_pose_mm")), _cell(figures.get("wrench_N"))]
-        table.add_row(*cells, style=None if trial["status"] == "completed" else "yellow")
+        name, status = escape(trial["name"]), trial["status"]
+        style = None if status == "completed" else "yellow"
+        for witness in ("measured", "truth"):
+            figures = trial[witness]
+            if figures is None and witness == "truth":
+                continue
+            cells = [_cell((figures or {}).get(key)) for key in ("go_pose_mm", "wrench_N")]
+            table.add_row(name, status, witness, *cells, style=style)
+            name = status = ""
     if not results["trials"]:
         table.add_row("no trial was run", results["status"])
     return table
@@ -40,7 +42,7 @@ def _cell(figure: dict[str, float] | None) -> str:
 
 def status_table(rows: Sequence[DeviceStatus]) -> Table:
     """One line per device."""
-    table = Table()
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for name in ("device", "kind", "backend", "alive"):
         table.add_column(name)
     for name in ("rate [Hz]", "age [s]", "gaps"):

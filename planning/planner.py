@@ -122,7 +122,7 @@ def _reference(problem: p2.P2) -> p2.Solution:
     return qp_reference.solve(problem)
 
 
-BACKENDS: dict[str, p2.Backend] = {"projection": p2.solve_by_projection, "reference": _reference}
+BACKENDS: dict[str, p2.Backend] = {"projection": p2.solve_by_projection, "cvxpylayers": _reference}
 """Ways to solve P2: the exact closed form, and cvxpylayers (`planning.qp_reference`)."""
 
 

@@ -1,11 +1,8 @@
 """P2 through cvxpylayers: the reference that every faster way is checked against.
 
 One compiled layer per pattern of modes. The solver is SCS with the dense derivative: the iterative default was wrong by
-more than 1 % on one gradient in five. Two things keep it accurate:
-
-* each step is scaled to unit force, and its weights go into the cones, since SCS stops on absolute residuals;
-* every parameter that stands in the constraint matrix is non-zero, since diffcp drops zeros from it and then loses
-  track of its entries in the backward pass.
+more than 1 % on one gradient in five. SCS stops on absolute residuals, so each step is scaled to unit force and its
+weights go into the cones.
 """
 
 from __future__ import annotations
@@ -75,7 +72,7 @@ def _solve_pattern(
     target = root * desired
     size = target.detach().abs().amax(dim=(1, 2), keepdim=True)
     size = torch.where(size > 0, size, torch.ones_like(size))
-    slope = mu * root[..., 1] / root[..., 0] + 1e-30  # not 0: a frictionless contact must keep its entry in the matrix
+    slope = mu * root[..., 1] / root[..., 0]
     length = (1 + slope**2).sqrt()
     parameters = ((target / size).flatten(1), slope / length, 1 / length)
     (solved, *multipliers), status = _run(_layer(pattern), parameters)

@@ -142,8 +142,7 @@ class Host:
             ):
                 stack.callback(self.desk.serve(topics.WORLD, verb, work))
             stack.callback(self.desk.serve(topics.WORLD, "describe", self._describe, direct=True))
-            token = self.bus.token(topics.alive(self.config.name, topics.WORLD))
-            stack.callback(token.undeclare)
+            stack.callback(self.bus.token(topics.alive(self.config.name, topics.WORLD)))
             ready()
             while not self._stopping:
                 wait = _IDLE if self.world.lockstep or not self._staged else self._pace()

@@ -6,6 +6,7 @@ body has the degrees of freedom (x, y, θ) of its frame in W, in this order, the
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import mujoco as _mujoco
@@ -18,6 +19,8 @@ from mechanics.readings import Array
 
 #: the bindings are compiled and come without type information
 mujoco: Any = _mujoco
+#: MuJoCo would otherwise write its warnings to a file in the current folder
+mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)
 
 #: half the depth of every prism [m]: contacts come in pairs at ±this depth, which keeps them symmetric
 HALF_DEPTH = 0.02
@@ -51,15 +54,16 @@ def build(scene: Scene, timestep: float) -> Any:
 
     world = spec.worldbody
     world.add_geom(name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=(5, 5, 0.1), contype=0, conaffinity=0)
-    geoms = {"go": _add_body(spec, "go", scene.grasped)}
-    pairs = [("go", "ground")]
+    geoms = {"ground": ["ground"], "go": _add_body(spec, "go", scene.grasped)}
+    # each contact is by the first on the second: MuJoCo orders the two by body, and the bodies are in this order
+    pairs = [("ground", "go", "go-ground")]
     if scene.extrinsic is not None:
         geoms["eo"] = _add_body(spec, "eo", scene.extrinsic)
-        pairs += [("go", "eo"), ("eo", "ground")]
-    for first, second in pairs:
-        mu = _friction(scene, f"{first}-{second}")
-        for a in geoms[first]:
-            for b in geoms.get(second, ["ground"]):
+        pairs += [("go", "eo", "go-eo"), ("ground", "eo", "eo-ground")]
+    for by, on, name in pairs:
+        mu = _friction(scene, name)
+        for a in geoms[by]:
+            for b in geoms[on]:
                 # an explicit pair, since MuJoCo would take the larger of the two bodies' own coefficients
                 spec.add_pair(
                     geomname1=a,

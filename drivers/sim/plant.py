@@ -244,11 +244,9 @@ class Plant:
                 continue
             on, by = self._owner[contact.geom[1]], self._owner[contact.geom[0]]
             mujoco.mj_contactForce(self.model, self.data, i, self._force)
-            # MuJoCo's normal points from the first geom into the second, and the force acts on the second
+            # the normal points from the first geom into the second, on which the force acts
             axes = contact.frame.reshape(3, 3)
             force, normal = (self._force[:3] @ axes)[[0, 2]], axes[0, [0, 2]]
-            if on == "ground" or (on, by) == ("go", "eo"):
-                on, by, force, normal = by, on, -force, -normal
             point = contact.pos[[0, 2]]
             for other in merged:
                 if other[:2] == [on, by] and np.abs(other[2] - point).max() < SAME_POINT and other[3] @ normal > 0.99:

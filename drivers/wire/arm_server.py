@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import threading
 import time
 
@@ -62,6 +63,7 @@ class ArmServer(DeviceServer):
         self._serve("acquire", self._acquire)
         self._serve("release", self._release)
         self._serve("renew", self._renew, direct=True)
+        self._serve("holders", self._holders, direct=True)
         self._serve("hold", lambda _: self.arm.hold(), urgent=True)
         self._serve("stop", lambda _: self.arm.stop(), urgent=True)
         self._serve("recover", lambda _: self.arm.recover(), urgent=True)
@@ -92,6 +94,11 @@ class ArmServer(DeviceServer):
         with self._lock:
             if not self._table.renew(holder, time.monotonic()):
                 raise CommandRefused(self.arm.name, "renew the lease", "it was lost", "Acquire it again")
+
+    def _holders(self, _: bytes) -> Answer:
+        with self._lock:
+            holder = self._table.holder(time.monotonic())
+        return Answer(json.dumps([] if holder is None else [nickname(holder)]))
 
     def _release(self, payload: bytes) -> None:
         holder = messages.decode(payload, messages.STRING).data

@@ -14,7 +14,7 @@ import time
 import weakref
 from collections.abc import Callable
 from types import TracebackType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import zenoh
 
@@ -63,12 +63,12 @@ class Publisher:
             encoding=zenoh.Encoding.APPLICATION_CDR.with_schema(type_name),
             congestion_control=control,
         )
-        self._token = bus.token(topics.discovery(bus.zid, topic, type_name))
+        self._withdraw = bus.token(topics.discovery(bus.zid, topic, type_name))
 
     @property
     def matched(self) -> bool:
         """Whether anybody listens; a stream that nobody hears need not be encoded."""
-        return self._publisher.matching_status
+        return _matching(self._publisher)
 
     def put(self, payload: bytes, sequence: int, capture_ns: int, status: int = 0) -> None:
         """Publish one message."""
@@ -78,7 +78,7 @@ class Publisher:
 
     def close(self) -> None:
         """Withdraw the stream; idempotent."""
-        _undeclare(self._token)
+        self._withdraw()
         _undeclare(self._publisher)
 
 
@@ -236,6 +236,7 @@ class Bus:
         self.endpoint, self.timeout = endpoint, timeout
         self._subscriptions: dict[str, Subscription] = {}
         self._queriers: dict[str, zenoh.Querier] = {}
+        self._tokens: set[zenoh.LivelinessToken] = set()
         self._lock = threading.Lock()
         self._closed = False
         settings = {
@@ -318,14 +319,16 @@ class Bus:
         queryable = self.session.declare_queryable(key, lambda query: handler(Query(key, query)))
         return lambda: _undeclare(queryable)
 
-    def token(self, key: str) -> zenoh.LivelinessToken:
-        """Declare a liveliness token; undeclare it, or close the bus, to withdraw it."""
-        return self.session.liveliness().declare_token(key)
+    def token(self, key: str) -> Callable[[], None]:
+        """Declare a liveliness token; returns the way to withdraw it, as closing the bus does."""
+        token = self.session.liveliness().declare_token(key)
+        self._tokens.add(token)  # one that nobody refers to would vanish
 
-    def tokens(self, pattern: str, timeout: float = 1.0) -> list[str]:
-        """The liveliness tokens of a pattern that are there now."""
-        replies = self.session.liveliness().get(pattern, timeout=timeout)
-        return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        def withdraw() -> None:
+            self._tokens.discard(token)
+            _undeclare(token)
+
+        return withdraw
 
     def watch(self, token: str) -> Watch:
         """Watch over a liveliness token."""
@@ -366,17 +369,16 @@ class Bus:
         )
         if watch is not None and watch.gone:
             raise dead
-        querier = self._querier(key)
-        if not self._matched(querier, deadline, watch):
-            if watch is not None and watch.gone:
-                raise dead
-            raise DeviceTimeout(device, asked, f"nobody serves {key}", "Check `extrinsic status STATION`")
         answers: queue.SimpleQueue[zenoh.Reply | str] = queue.SimpleQueue()
         withdraw = watch.once_gone(lambda: answers.put("dead")) if watch is not None else None
         try:
-            querier.get(
-                zenoh.handlers.Callback(answers.put, lambda: answers.put("end"), indirect=False), payload=payload
-            )
+            querier = self._querier(key)
+            if not self._matched(querier, deadline, watch):
+                if watch is not None and watch.gone:
+                    raise dead
+                raise DeviceTimeout(device, asked, f"nobody serves {key}", "Check `extrinsic status STATION`")
+            handler = zenoh.handlers.Callback(answers.put, lambda: answers.put("end"), indirect=False)
+            querier.get(handler, payload=payload)
             answer = answers.get(timeout=max(deadline - time.monotonic(), 0.0))
         except queue.Empty:
             raise DeviceTimeout(
@@ -406,11 +408,17 @@ class Bus:
 
     @staticmethod
     def _matched(querier: zenoh.Querier, deadline: float, watch: Watch | None) -> bool:
-        while not querier.matching_status:
+        while not _matching(querier):
             if time.monotonic() >= deadline or (watch is not None and watch.gone):
                 return False
             time.sleep(0.0005)
         return True
+
+
+def _matching(end: zenoh.Publisher | zenoh.Querier) -> bool:
+    """Whether the other end is there. The library's stub says bool; what comes is an object that is always true."""
+    status: Any = end.matching_status
+    return status if isinstance(status, bool) else status.matching
 
 
 def _undeclare(entity: zenoh.Publisher | zenoh.Subscriber | zenoh.Queryable | zenoh.LivelinessToken) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, DriverError, NotConnected, ProtocolError
 from drivers.interfaces import Arm, ArmTarget, Description, ForceTorqueSensor, Gripper, R, Sensor, TagCamera
 from drivers.wire import messages, topics
-from drivers.wire.arm_server import holder_id, nickname
+from drivers.wire.arm_server import holder_id
 from drivers.wire.bus import Bus, Sample, Subscription, Watch
 from drivers.wire.codec import decode_reading
 from drivers.wire.lease import RENEWAL, TIME_TO_LIVE
@@ -236,7 +236,7 @@ class RemoteArm(RemoteSensor[PoseReading], Arm):
     def __init__(self, name: str, link: Link, lockstep: bool, buffer: int = 4096):
         super().__init__(name, link, lockstep, buffer)
         self._holder: str | None = None
-        self._token: Any = None
+        self._withdraw: Callable[[], None] = lambda: None
         self._targets = 0
         self._done = threading.Event()
         self._renewer: threading.Thread | None = None
@@ -248,11 +248,11 @@ class RemoteArm(RemoteSensor[PoseReading], Arm):
             raise CommandRefused(self.name, "acquire the lease", "this client has it already", "Release it first")
         self._acquired += 1
         name = holder_id(holder, self._link.bus.zid, self._acquired)
-        self._token = self._link.bus.token(topics.lease(self._link.station, self.name, name))
+        self._withdraw = self._link.bus.token(topics.lease(self._link.station, self.name, name))
         try:
             self._ask("acquire", _string(name), "acquire the lease")
         except BaseException:
-            self._token.undeclare()
+            self._withdraw()
             raise
         self._holder, self._targets = name, 0
         self._done.clear()
@@ -272,7 +272,7 @@ class RemoteArm(RemoteSensor[PoseReading], Arm):
         except (DeviceFault, DeviceTimeout):
             pass
         finally:
-            self._token.undeclare()
+            self._withdraw()
 
     def command(self, target: ArmTarget) -> None:
         """As `Arm.command`. The sequence number is counted here, whatever the target says."""
@@ -310,9 +310,8 @@ class RemoteArm(RemoteSensor[PoseReading], Arm):
         self._command("recover")
 
     def lease_holders(self) -> list[str]:
-        """The names of those who hold or are about to take the arm's lease."""
-        tokens = self._link.bus.tokens(topics.lease(self._link.station, self.name, "*"))
-        return sorted(nickname(topics.holder_of(token)) for token in tokens)
+        """Who has the arm's lease; asks the server. Raises DeviceTimeout, DeviceFault."""
+        return json.loads(self._ask("holders", asked="name its commander").text)
 
     def _shut(self) -> None:
         self.release()

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -164,7 +164,7 @@ class DeviceServer:
         self.desk, self.device = desk, device
         self._stops: list[Callable[[], None]] = []
         self._streams: dict[str, Publisher] = {}
-        self._token: Any = None
+        self._withdraw: Callable[[], None] = lambda: None
 
     def __enter__(self) -> Self:
         self.open()
@@ -185,16 +185,15 @@ class DeviceServer:
             self._stops.append(device.listen(self._publish))
         self._serve("describe", lambda _: Answer(json.dumps(asdict(self.device.describe()))), direct=True)
         self._verbs()
-        self._token = self.desk.bus.token(topics.alive(self.desk.station, device.name))
+        self._withdraw = self.desk.bus.token(topics.alive(self.desk.station, device.name))
 
     def close(self) -> None:
         """Withdraw from the bus and close the device, which holds an arm; idempotent."""
         stops, self._stops = self._stops, []
         for stop in reversed(stops):
             stop()
-        if self._token is not None:
-            self._token.undeclare()
-            self._token = None
+        self._withdraw()
+        self._withdraw = lambda: None
         for publisher in self._streams.values():
             publisher.close()
         self._streams = {}

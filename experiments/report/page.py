@@ -14,7 +14,7 @@ def render(data: Mapping[str, Any]) -> str:
     """One self-contained HTML page of a run; opened from disk it makes no request.
 
     ``data`` is JSON-able: ``results`` (results.json), ``title``, ``created``, ``objects`` (outlines in body frames
-    [m]), ``grasp`` X_go_gocf, ``trials`` (way-points and playback: poses (x, y, θ) in W, wrenches (fx, fy, τ) of the
+    [m]), ``grasp`` X_go_gocf, ``trials`` (waypoints and playback: poses (x, y, θ) in W, wrenches (fx, fy, τ) of the
     sensor on the go about the grasp centre, axes of W, contacts with point and force in W; SI), ``log``, ``events``,
     ``paper`` (see `summary.error_table`). What is missing, None or NaN is left out and the page says so, so that an
     aborted, empty or torn run has its report as well. Raises TypeError when ``data`` is no mapping.
@@ -22,12 +22,13 @@ def render(data: Mapping[str, Any]) -> str:
     if not isinstance(data, Mapping):
         raise TypeError(f"render: expected a mapping with results, trials, objects …, got {type(data).__name__}")
     data = payload.clean(data)
-    results = data.get("results") if isinstance(data.get("results"), dict) else {}
+    found = data.get("results")
+    results: dict[str, Any] = found if isinstance(found, dict) else {}
     carried = payload.build(data)
-    figures = [traces.figure(trial) for trial in carried["trials"]]
-    plotted = any(figure is not None for figure in figures)
+    carried["figures"] = [traces.figure(trial) for trial in carried["trials"]]
+    carried["styles"] = traces.styles()
+    plotted = any(figure is not None for figure in carried["figures"])
     provenance = results.get("provenance")
-    carried["figures"] = [None if f is None else payload.clean(traces.skeleton(f), payload.DIGITS) for f in figures]
     return _template().render(
         title=str(data.get("title") or "Untitled run"),
         verdict=summary.verdict(results),

@@ -18,7 +18,7 @@ import numpy as np
 MODES = ("stick", "slip+", "slip-", "free")
 SERIES = ("ee", "go", "eo", "wrench")
 BUDGET = 2_800_000  # bytes of data; with plotly's 4.8 MB the page stays under 8 MB
-FIGURE = 12_000  # bytes that the traces of a trial add
+FIGURE = 13_000  # bytes that the traces of a trial add
 FEWEST = 25  # frames that a playback keeps however many trials there are
 DIGITS = 6  # 1 µm, 1 µrad, 1 µN: finer than any pixel
 
@@ -47,7 +47,7 @@ def encode(value: Any) -> str:
 
 
 def build(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The page's data: objects (outlines, body frame), grasp X_go_gocf, and per trial its way-points and playback."""
+    """The page's data: objects (outlines, body frame), grasp X_go_gocf, and per trial its waypoints and playback."""
     objects = _mapping(data.get("objects"))
     trials = [_mapping(trial) for trial in _list(data.get("trials"))]
     out = {
@@ -121,7 +121,7 @@ def _contacts(value: Any, count: int) -> list[list[list[Any]]]:
 
 
 def _times(value: Any, count: int) -> tuple[list[float], list[bool]]:
-    """Instants of the way-points [s] and which of them were reached; those that were not follow at the usual step."""
+    """Instants of the waypoints [s] and which of them were reached; those that were not follow at the usual step."""
     known = [_number(t) for t in _list(value)[:count]]
     known += [None] * (count - len(known))
     reached = [t is not None for t in known]
@@ -165,7 +165,7 @@ def _take_turn(found: dict[str, Any] | None, planned: dict[str, Any] | None) -> 
 
 
 def _playback(value: Any, waypoints: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The recorded frames in the order of time; from the way-points where no frame was recorded."""
+    """The recorded frames in the order of time; from the waypoints where no frame was recorded."""
     source = _mapping(value)
     stamps = [_number(t) for t in _list(source.get("t"))]
     frames = sorted((t, i) for i, t in enumerate(stamps) if t is not None)
@@ -202,7 +202,7 @@ def _stepwise(waypoints: dict[str, Any] | None) -> dict[str, Any] | None:
                 "t": list(waypoints["t"]),
                 **waypoints[source],
                 "contacts": waypoints["contacts"] if source == "planned" else [[] for _ in waypoints["t"]],
-                "source": f"{source}, way-points only",
+                "source": f"{source}, waypoints only",
                 "phases": [],
                 "recorded": 0,
             }

@@ -38,7 +38,7 @@ const Player = (() => {
     };
   };
 
-  // The way-point that is under way at t: the first one not yet passed, the last one after all.
+  // The waypoint that is under way at t: the first one not yet passed, the last one after all.
   const target = (t) => {
     const times = trial.waypoints?.t;
     if (!times) return -1;
@@ -73,7 +73,7 @@ const Player = (() => {
     $("now-head").title = source;
     const thinned = trial.playback && trial.playback.recorded > trial.playback.t.length
       ? ` Shown: ${trial.playback.t.length} of ${trial.playback.recorded} recorded frames.` : "";
-    $("values-note").textContent = `now: ${source}; planned, measured and truth: at the way-point under way.${thinned}`;
+    $("values-note").textContent = `now: ${source}; planned, measured and truth: at the waypoint under way.${thinned}`;
   };
 
   const buildTimeline = () => {
@@ -118,7 +118,7 @@ const Player = (() => {
       rows.forEach((row, i) => { numbers[i].textContent = format(row ? row[component] * factor : null, digits); });
     }
     const count = trial.waypoints?.t.length || 0, phase = (trial.playback.phases.findLast((p) => p[1] <= time + 1e-9) || [""])[0];
-    const clock = [`${time.toFixed(2)} s of ${span()[1].toFixed(2)} s`, count ? `way-point ${k + 1} of ${count}` : "", phase.replaceAll("_", " ")].filter(Boolean).join("\n");
+    const clock = [`${time.toFixed(2)} s of ${span()[1].toFixed(2)} s`, count ? `waypoint ${k + 1} of ${count}` : "", phase.replaceAll("_", " ")].filter(Boolean).join("\n");
     $("clock").textContent = clock;
     $("time").value = time;
     $("time").setAttribute("aria-valuetext", clock.replaceAll("\n", ", "));

@@ -52,6 +52,8 @@ def verdict(results: Mapping[str, Any]) -> Verdict:
     failed = next((trial for trial in trials if trial.get("status") in ABORTING), None)
     if not status:
         return Verdict("aborted", "Aborted", f"results.json does not say how the run ended; {count}.")
+    if status == "running":
+        return Verdict("aborted", "Aborted", f"{count}; the run was cut off while it was running{tail}")
     if status not in COMPLETED | SHORT:
         return Verdict("aborted", "Aborted", f"{count}; the run ended with status “{words(status)}”{tail}")
     if failed is not None:
@@ -146,14 +148,15 @@ def _is_number(value: Any) -> TypeGuard[int | float]:
 def log_summary(log: Any, trials: int) -> dict[str, Any] | None:
     """What the log holds, per topic and in sum; None where there is no log.
 
-    An optional ``torn`` (true, or what is known of it) marks a log that was cut off.
+    ``ending`` other than ``complete`` says how the log broke off; it is optional, as is ``torn`` (true for one that
+    was cut off somewhere).
     """
     source = _mapping(log)
-    if not source:
+    ending = str(source.get("ending") or ("the end is missing" if source.get("torn") else "complete"))
+    if not source or not (source.get("bytes") or source.get("messages")):
         return None
     counts = {str(k): int(v) for k, v in _mapping(source.get("messages")).items() if _is_number(v)}
     seconds, size, lost = (v if _is_number(v := source.get(key)) else None for key in ("seconds", "bytes", "lost"))
-    torn = source.get("torn")
     return {
         "file": str(source.get("file") or "log.mcap"),
         "total": f"{sum(counts.values()):,}",
@@ -161,7 +164,7 @@ def log_summary(log: Any, trials: int) -> dict[str, Any] | None:
         "size": None if size is None else f"{size / 1e6:.2f} MB",
         "per_trial": None if size is None or not trials else f"{size / 1e6 / trials:.2f} MB",
         "seconds": None if seconds is None else f"{seconds:.1f} s",
-        "torn": "" if not torn else torn if isinstance(torn, str) else "The log was cut off before it was closed.",
+        "torn": "" if ending == "complete" else f"The log was not closed in order: {ending.rstrip('.')}.",
         "topics": [(t, f"{n:,}", f"{n / seconds:.1f}" if seconds else "–") for t, n in sorted(counts.items())],
     }
 
@@ -186,10 +189,9 @@ def event_rows(events: Any) -> list[dict[str, str]]:
 def plan_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
     """The plans of results.json as text: name, skill, planner, steps, queries, time, loss, status."""
     keys = ("name", "skill", "planner", "steps", "queries", "time_s", "loss", "status")
-    plans = results.get("plans")
-    return [
-        {key: _plain(_mapping(plan).get(key)) for key in keys} for plan in (plans if isinstance(plans, list) else [])
-    ]
+    found = results.get("plans")
+    plans = [_mapping(plan) for plan in found] if isinstance(found, list) else []
+    return [{key: f"{v:.4g}" if isinstance(v := plan.get(key), float) else _plain(v) for key in keys} for plan in plans]
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, str]]:

@@ -49,8 +49,8 @@
       uirevision: `${Player.index} ${deviation}`,
     };
     const data = figure.data.map((trace) => {
-      const color = roles[trace.meta.role];
-      return { ...trace, ...points(trace.meta, deviation), line: { ...trace.line, color }, marker: { ...trace.marker, color } };
+      const color = roles[trace.meta.role], look = Player.data.styles[trace.meta.role];
+      return { ...look, ...trace, ...points(trace.meta, deviation), line: { ...look.line, color }, marker: { ...look.marker, color } };
     });
     for (const key of numbered(layout, "x")) layout[key] = { ...layout[key], ...axis };
     for (const key of numbered(layout, "y")) {

@@ -1,16 +1,14 @@
-"""Planned against measured and true: poses and wrenches of a trial over time, as plotly figures.
+"""Planned against measured and true: poses and wrenches of a trial over time, as figures in plotly's JSON form.
 
-Colours are the page's business (light, dark, print): a trace says its ``meta.role`` and the page gives the colour.
+Colours are the page's business (light, dark, print): a trace says its role and the page gives the colour. The points
+are in the page already, for the scene; ``meta`` of a trace says which of them it shows.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from plotly.graph_objects import Figure
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 # symbol, unit, factor from SI, smallest span of the axis in that unit (so that noise does not fill a flat panel)
 Panel = tuple[str, str, float, float]
@@ -24,97 +22,94 @@ WRENCH: tuple[Panel, ...] = (
     ("fy", "N", 1.0, 0.5),
     ("τ", "N·mm", 1e3, 20.0),
 )
-ROWS = (
-    ("go", "grasped object", POSE),
-    ("eo", "extrinsic object", POSE),
-    ("ee", "end-effector", POSE),
-    ("wrench", "sensor on grasped object", WRENCH),
-)
+ROWS = {"go": POSE, "eo": POSE, "ee": POSE, "wrench": WRENCH}
 STYLES: dict[str, dict[str, Any]] = {
     "recorded": {"mode": "lines", "line": {"width": 1}, "hoverinfo": "skip", "opacity": 0.45},
     "planned": {"mode": "lines", "line": {"width": 2, "dash": "dash"}},
     "measured": {"mode": "lines+markers", "line": {"width": 1.25}, "marker": {"size": 6, "symbol": "circle"}},
     "truth": {"mode": "lines+markers", "line": {"width": 1.25}, "marker": {"size": 6, "symbol": "diamond-open"}},
 }
-ROW_HEIGHT, MARGIN = 165, 106  # [px]
+FOUND = ("planned", "measured", "truth")
+COLUMNS = 3
+PANEL_HEIGHT, TITLE_HEIGHT, TOP, BOTTOM = 122, 43, 62, 44  # [px]
+COLUMN_GAP = 0.065  # of the width
 
 
-def figure(trial: Mapping[str, Any]) -> Figure | None:
+def styles() -> dict[str, dict[str, Any]]:
+    """How each role is drawn, in plotly's terms: dashes and symbols tell the roles apart where colour does not."""
+    common = {role: {"type": "scatter", "name": role, "legendgroup": role} for role in STYLES}
+    hover = {role: {"hovertemplate": f"%{{y:.3f}}<extra>{role}</extra>"} for role in FOUND}
+    return {role: {**common[role], **hover.get(role, {}), **style} for role, style in STYLES.items()}
+
+
+def figure(trial: Mapping[str, Any]) -> dict[str, Any] | None:
     """Small multiples of one trial as `payload.build` gives it: a row per body, a column per component.
 
-    y in mm, deg, N and N·mm; x in s. ``meta`` of a trace: role, series, component, factor from SI. The ``recorded``
-    traces are empty: the page fills them from the playback. None where the trial has no way-points.
+    ``data``: per trace its axes and ``meta`` = role, series, component and the factor from SI to mm, deg, N or N·mm;
+    ``layout``: plotly's, times in s. None where the trial has no waypoints.
     """
-    from plotly.subplots import make_subplots
-
     waypoints = trial["waypoints"]
-    if waypoints is None:
-        return None
-    sources = {role: waypoints[role] for role in ("planned", "measured", "truth") if waypoints[role] is not None}
-    rows = [row for row in ROWS if any(series[row[0]] is not None for series in sources.values())]
+    sources = {role: waypoints[role] for role in FOUND if waypoints[role] is not None} if waypoints else {}
+    rows = [row for row in ROWS if any(series[row] is not None for series in sources.values())]
     if not rows:
         return None
-    titles = [f"{body} {symbol} [{unit}]" for body, _, panels in rows for symbol, unit, _, _ in panels]
-    titles = [title.removeprefix("wrench ") for title in titles]
-    height = ROW_HEIGHT * len(rows) + MARGIN
-    spacing = 46 / (height - MARGIN)
-    fig = make_subplots(len(rows), 3, subplot_titles=titles, horizontal_spacing=0.065, vertical_spacing=spacing)
-    shown: set[str] = set()
-    for i, (body, _, panels) in enumerate(rows):
-        for j, (_, _, factor, span) in enumerate(panels):
-            curves = {role: _curve(series[body], j, factor) for role, series in sources.items()}
-            for role in ("recorded", *curves):
+    height = TOP + BOTTOM + PANEL_HEIGHT * len(rows) + TITLE_HEIGHT * (len(rows) - 1)
+    layout = _layout(height)
+    data: list[dict[str, Any]] = []
+    for i, body in enumerate(rows):
+        for j, (symbol, unit, factor, span) in enumerate(ROWS[body]):
+            suffix = "" if i == j == 0 else str(i * COLUMNS + j + 1)
+            for role in ("recorded", *sources):
                 meta = {"role": role, "series": body, "component": j, "factor": factor}
-                fig.add_scatter(
-                    x=[] if role == "recorded" else waypoints["t"],
-                    y=curves.get(role, []),
-                    name=role,
-                    legendgroup=role,
-                    showlegend=role not in shown,
-                    meta=meta,
-                    hovertemplate=None if role == "recorded" else f"%{{y:.3f}}<extra>{role}</extra>",
-                    row=i + 1,
-                    col=j + 1,
-                    **STYLES[role],
-                )
-                shown.add(role)
-            fig.update_yaxes(range=_range(curves.values(), span), row=i + 1, col=j + 1)
-    _lay_out(fig, waypoints["t"], len(rows), height)
-    return fig
+                data.append({"xaxis": f"x{suffix}", "yaxis": f"y{suffix}", "showlegend": i == j == 0, "meta": meta})
+            values = [row[j] * factor for series in sources.values() for row in series[body] or () if row is not None]
+            across, along = _column(j), _row(i, len(rows))
+            last = i == len(rows) - 1
+            layout[f"xaxis{suffix}"] = {
+                **{"domain": across, "anchor": f"y{suffix}", "range": _span(waypoints["t"]), "showticklabels": last},
+                **({"title": {"text": "time [s]", "standoff": 6}} if last else {}),
+                **({"matches": "x"} if suffix else {}),
+            }
+            layout[f"yaxis{suffix}"] = {"domain": along, "anchor": f"x{suffix}", "range": _range(values, span)}
+            title = f"{symbol} [{unit}]" if body == "wrench" else f"{body} {symbol} [{unit}]"
+            layout["annotations"].append(_title(title, across[0], along[1]))
+    return {"data": data, "layout": layout}
 
 
-def skeleton(fig: Figure) -> dict[str, Any]:
-    """The figure as JSON without its points: the page takes them from the way-points by each trace's ``meta``."""
-    parts = fig.to_plotly_json()
-    parts["data"] = [{key: value for key, value in trace.items() if key not in {"x", "y"}} for trace in parts["data"]]
-    return parts
+def _layout(height: int) -> dict[str, Any]:
+    return {
+        "height": height,
+        "margin": {"l": 52, "r": 8, "t": TOP, "b": BOTTOM},
+        "hovermode": "x unified",
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "top", "yref": "container"},
+        "dragmode": "zoom",
+        "annotations": [],
+    }
 
 
-def _curve(rows: Sequence[Sequence[float] | None] | None, component: int, factor: float) -> list[float | None]:
-    return [None if row is None else round(row[component] * factor, 5) for row in rows or []]
+def _title(text: str, x: float, y: float) -> dict[str, Any]:
+    at = {"x": x, "y": y, "xref": "paper", "yref": "paper", "xanchor": "left", "yanchor": "bottom"}
+    return {"text": text, "font": {"size": 12}, "yshift": 2, "showarrow": False, **at}
 
 
-def _range(curves: Any, span: float) -> list[float]:
-    """Limits that hold all curves with a margin and are at least ``span`` apart."""
-    values = [value for curve in curves for value in curve if value is not None]
-    low, high = (min(values), max(values)) if values else (0.0, 0.0)
-    middle, half = (low + high) / 2, max(high - low, span) / 2 * 1.12
-    return [round(middle - half, 5), round(middle + half, 5)]
+def _column(j: int) -> list[float]:
+    width = (1 - COLUMN_GAP * (COLUMNS - 1)) / COLUMNS
+    return [round(j * (width + COLUMN_GAP), 6), round(j * (width + COLUMN_GAP) + width, 6)]
 
 
-def _lay_out(fig: Figure, times: Sequence[float], rows: int, height: int) -> None:
+def _row(i: int, count: int) -> list[float]:
+    inner = PANEL_HEIGHT * count + TITLE_HEIGHT * (count - 1)
+    top = 1 - i * (PANEL_HEIGHT + TITLE_HEIGHT) / inner
+    return [round(max(0.0, top - PANEL_HEIGHT / inner), 6), round(top, 6)]
+
+
+def _span(times: Sequence[float]) -> list[float]:
     margin = max(times[-1] - times[0], 1.0) * 0.03
-    fig.update_xaxes(range=[times[0] - margin, times[-1] + margin], matches="x", showticklabels=False)
-    fig.update_xaxes(title={"text": "time [s]", "standoff": 6}, showticklabels=True, row=rows)
-    fig.layout.xaxis.matches = None  # the one that the others match
-    fig.update_annotations(xanchor="left", font={"size": 12}, yshift=2)
-    for annotation, axis in zip(fig.layout.annotations, fig.select_xaxes(), strict=True):
-        annotation.x = axis.domain[0]
-    fig.update_layout(
-        template="none",
-        height=height,
-        margin={"l": 52, "r": 8, "t": 62, "b": 44},
-        hovermode="x unified",
-        legend={"orientation": "h", "x": 0, "y": 1, "yanchor": "top", "yref": "container"},
-        dragmode="zoom",
-    )
+    return [round(times[0] - margin, 6), round(times[-1] + margin, 6)]
+
+
+def _range(values: Iterable[float], span: float) -> list[float]:
+    """Limits that hold all values with a margin and are at least ``span`` apart."""
+    known = sorted(values) or [0.0]
+    middle, half = (known[0] + known[-1]) / 2, max(known[-1] - known[0], span) / 2 * 1.12
+    return [round(middle - half, 6), round(middle + half, 6)]

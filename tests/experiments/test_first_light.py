@@ -29,7 +29,7 @@ def without_times_and_provenance(results):
 def test_the_run_is_done_and_ends_with_the_reports_path(ideal):
     assert ideal.code == 0, ideal.err
     assert ideal.results["status"] == "completed"
-    path = re.search(r"report: (\S+)", ideal.out.splitlines()[-1])[1]
+    [path] = re.findall(r"report: (\S+)", ideal.out.splitlines()[-1])
     assert (ideal.folder.parent / path).read_text().lower().startswith("<!doctype html>")
 
 
@@ -63,10 +63,11 @@ def test_every_published_message_was_logged(ideal):
     assert account["lost"] == 0
     assert account["published"]["sim/wrist_ft/wrench"] > 1000
     with (ideal.folder / "log.mcap").open("rb") as file:
-        statistics = make_reader(file).get_summary().statistics
-        channels = {c.topic: c.id for c in make_reader(file).get_summary().channels.values()}
+        summary = make_reader(file).get_summary()
+    assert summary is not None and summary.statistics is not None
+    ids = {channel.topic: channel.id for channel in summary.channels.values()}
     for topic, count in account["published"].items():
-        assert statistics.channel_message_counts[channels[topic]] == count, topic
+        assert summary.statistics.channel_message_counts[ids[topic]] == count, topic
 
 
 def test_the_same_seed_gives_the_same_results(ideal, shared_command):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from experiments.metrics import errors_of, paper_summary, pose_errors
+from experiments import metrics
+from experiments.metrics import paper_summary, pose_errors
 from mechanics.records import PlanarState, WaypointRecord
 
 
@@ -11,6 +12,12 @@ def waypoint(go, wrench, truth=None, eo=None):
     planned = PlanarState(np.zeros(3), np.zeros(3), None if eo is None else np.zeros(3), np.zeros(3))
     measured = PlanarState(np.zeros(3), None if go is None else np.array(go), eo, np.array(wrench))
     return WaypointRecord(0, "t", 0, planned, np.zeros(3), measured, truth)
+
+
+def errors_of(*arguments) -> dict:
+    figures = metrics.errors_of(*arguments)
+    assert figures is not None
+    return figures
 
 
 def test_one_waypoint_gives_the_norm_with_the_radius_of_gyration():
@@ -40,12 +47,12 @@ def test_an_object_that_was_never_seen_has_no_pose_figure():
 
 
 def test_without_waypoints_or_witness_there_are_no_figures():
-    assert errors_of([], "measured", 1, None, 1) is None
-    assert errors_of([waypoint([0, 0, 0], [0, 0, 0])], "truth", 1, None, 1) is None
+    assert metrics.errors_of([], "measured", 1, None, 1) is None
+    assert metrics.errors_of([waypoint([0, 0, 0], [0, 0, 0])], "truth", 1, None, 1) is None
 
 
 def test_angle_errors_wrap():
-    assert pose_errors([[0, 0, 3.1]], [[0, 0, -3.1]])[0, 2] == pytest.approx(6.2 - 2 * np.pi)
+    assert pose_errors([np.array([0, 0, 3.1])], [np.array([0, 0, -3.1])])[0, 2] == pytest.approx(6.2 - 2 * np.pi)
 
 
 @pytest.mark.parametrize(

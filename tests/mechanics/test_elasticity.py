@@ -94,6 +94,17 @@ def test_torch_differentiates_through_poses_wrenches_and_stiffness():
         assert torch.autograd.gradcheck(function, (go, grasp, w, L), atol=1e-5)
 
 
+def test_go_pose_and_its_derivative_hold_where_the_wrench_turns_a_soft_finger():
+    """A weak angle coupled to the force: the object turns by a quarter of a radian, and its angle's equation bends."""
+    soft = Elasticity([[100.0, 0, 1.0], [0, 100.0, -1.0], [1.0, -1.0, 0.1]])
+    X_W_go, grasp, w = np.array([0.1, 0.2, 0.3]), np.array([0.0, 0.02, 0.1]), np.array([1.0, -1.0, 0.0])
+    X_W_ee = soft.ee_pose(X_W_go, grasp, w)
+    assert abs(X_W_ee[2] - X_W_go[2] - grasp[2]) > 0.2
+    np.testing.assert_allclose(soft.go_pose(X_W_ee, grasp, w), X_W_go, atol=1e-12)
+    inputs = [torch.tensor(value, requires_grad=True) for value in (X_W_ee, grasp, w)]
+    assert torch.autograd.gradcheck(soft.go_pose, inputs)
+
+
 def test_a_wrench_beyond_what_the_finger_carries_is_refused():
     soft = Elasticity(np.array([[100.0, 0, 0.9], [0, 100.0, 0], [0.9, 0, 0.01]]))
     with pytest.raises(ValueError, match="expected a wrench that the finger can carry"):

@@ -62,7 +62,7 @@ def test_a_flat_stance_has_two_contacts_that_share_the_force(tall_box, statics):
     np.testing.assert_allclose([contact.p_goC[0] for contact in task.contacts], [-0.025, 0.025])
     total = np.sum([contact.force for contact in task.contacts], axis=0)
     np.testing.assert_allclose(total[[0, -1]], [[3, 0.5], [5, 0.5]])
-    for backend in ("projection", "reference"):
+    for backend in ("projection", "cvxpylayers"):
         p = plan(task, "flat", backend=backend)
         for k in (0, 19):
             np.testing.assert_allclose(statics.residual(p, k, 0.1, 9.81), 0, atol=1e-12)

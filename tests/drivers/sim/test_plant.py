@@ -77,6 +77,25 @@ def test_sagged_go_is_in_balance(ee, grasp):
     assert torque + lever[0] * 0.981 == pytest.approx(0.0, abs=1e-12)
 
 
+@given(
+    ee=st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.5, 0.5)),
+    centre=st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
+    spin=st.floats(-2, 2),
+)
+def test_common_rigid_motion_is_not_damped(ee, centre, spin):
+    """Go and ee turn together about any point: x does not change, so only K x acts."""
+    stiffness = np.array([[2208.96, -143.31, 17.91], [-143.31, 1875.92, -14.05], [17.91, -14.05, 3.228]])
+    coupling = Coupling(stiffness, (0.0, 0.045, 0.2), 0.1, 2e-4)
+
+    def twist(x, y, _angle):
+        return (-spin * (y - centre[1]), spin * (x - centre[0]), spin)
+
+    go = (0.02, -0.01, 0.3)
+    still = coupling.grip(go, REST, ee, REST)
+    turning = coupling.grip(go, twist(*go), ee, twist(*ee))
+    np.testing.assert_allclose(turning, still, atol=1e-9)
+
+
 def test_sagged_go_stays_at_rest(make_scene):
     plant = Plant(make_scene(start=(0.1, 0.3, 0.6)))
     before = plant.go
@@ -210,6 +229,20 @@ def test_go_dragged_over_the_eo_has_the_signs_of_the_convention(make_scene, dire
     assert contact.force[0] / -contact.force[1] == pytest.approx(direction * 0.33, rel=0.02)
 
 
+def test_velocity_of_a_contact_point_is_that_of_its_body(make_scene):
+    """Against the difference of where a body-fixed point is before and after one step."""
+    plant = Plant(make_scene())
+    plant.data.qvel[:3] = 0.3, -0.2, 2.0
+    point = np.array([0.05, 0.2])
+    x, y, angle = plant.go
+    plant.step(plant.ee_pose, REST)
+    X, Y, turned = plant.go
+    c, s = np.cos(turned - angle), np.sin(turned - angle)
+    moved = np.array([X, Y]) + np.array([[c, -s], [s, c]]) @ (point - (x, y))
+    # the step's velocity is the new one; the point moves by half a millimetre meanwhile
+    np.testing.assert_allclose(plant._velocity("go", 0.5 * (point + moved)), (moved - point) / 1e-3, atol=1e-3)
+
+
 # -- health --------------------------------------------------------------------------------------------------------
 
 
@@ -241,7 +274,8 @@ def test_reset_repeats_the_run(make_scene):
 
 
 @pytest.mark.parametrize("velocity", [np.nan, np.inf, 1e5])
-def test_diverged_state_is_a_fault_until_reset(make_scene, velocity):
+def test_diverged_state_is_a_fault_until_reset(make_scene, velocity, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     plant = Plant(make_scene())
     plant.data.qvel[0] = velocity
     for _ in range(2):
@@ -250,6 +284,7 @@ def test_diverged_state_is_a_fault_until_reset(make_scene, velocity):
         assert caught.value.device == "world" and caught.value.recoverable
     plant.reset()
     rest(plant, 0.01)
+    assert not list(tmp_path.iterdir()), "no log file of the physics engine lies about"
 
 
 def test_ee_that_is_nowhere_is_a_fault(make_scene):

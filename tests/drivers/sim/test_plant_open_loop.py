@@ -163,10 +163,12 @@ def test_stiffness_scale_softens_the_fingers_and_nothing_else(make_scene):
 
 
 def test_stiff_fingers_are_resolved(preloaded):
-    """The GelSlim's printed K, which one step of 1 ms could not follow."""
-    gelslim = ((5060.26, -1261.90, -158.71), (-1261.90, 9998.16, 334.56), (-158.71, 334.56, 37.6311))
+    """Four times the GelSlim's printed K, whose fastest motion one step of 1 ms could not follow."""
+    printed = np.array([[5060.26, -1261.90, -158.71], [-1261.90, 9998.16, 334.56], [-158.71, 334.56, 37.6311]])
+    gelslim = tuple(map(tuple, (4 * printed).tolist()))
     push = np.array([0.0, 4.0])
     plant = preloaded(np.radians(15), push, stiffness=gelslim).plant
     go, _, wrench = statics(np.radians(15), push, np.array(gelslim))
-    assert np.abs(plant.go - go)[:2].max() < 0.02e-3
-    assert np.abs(plant.coupling_wrench() - wrench)[:2].max() < 0.03
+    # the corner sinks in by a micrometre or two, which at this stiffness is a tenth of a newton
+    assert np.abs(plant.go - go)[:2].max() < 0.005e-3
+    assert np.abs(plant.coupling_wrench() - wrench)[:2].max() < 0.15

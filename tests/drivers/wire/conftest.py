@@ -9,7 +9,6 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from hypothesis import settings
 
 from drivers.errors import CommandRefused, DeviceFault
 from drivers.interfaces import Arm, ArmTarget, Description, ForceTorqueSensor
@@ -17,10 +16,6 @@ from drivers.wire.bus import Bus, open_buses
 from drivers.wire.link import Link
 from drivers.wire.server import Desk
 from mechanics.readings import PoseReading, Stamp, WrenchReading
-
-# the first message of a type compiles its serialiser, and no property here is about speed
-settings.register_profile("untimed", deadline=None)
-settings.load_profile("untimed")
 
 
 def free_endpoint() -> str:
@@ -84,7 +79,16 @@ class FakeForceTorque(ForceTorqueSensor):
 
     def describe(self) -> Description:
         return Description(
-            self.name, "force_torque", "fake", "fake", "0", self.name, 1000.0, (65.0,) * 6, (0.1,) * 6, {"mount": "wrist"}
+            self.name,
+            "force_torque",
+            "fake",
+            "fake",
+            "0",
+            self.name,
+            1000.0,
+            (65.0,) * 6,
+            (0.1,) * 6,
+            {"mount": "wrist"},
         )
 
     def tare(self) -> None:

@@ -27,6 +27,7 @@ from mechanics.readings import (
 from mechanics.records import EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
 from mechanics.task_plane import TaskPlane
 
+STOCK = get_typestore(Stores.ROS2_HUMBLE)
 numbers = st.floats(-1e6, 1e6)
 names = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20)
 captures = st.integers(0, 2**31 * 10**9 - 1)
@@ -51,7 +52,11 @@ def poses(draw: st.DrawFn) -> PoseReading:
 wrenches = st.builds(WrenchReading, stamps(), vectors(6, st.floats(allow_nan=False)))
 grippers = st.builds(GripperReading, stamps(), numbers, numbers, st.booleans())
 detections = st.builds(
-    TagDetection, st.integers(0, 586), vectors(8).map(lambda v: v.reshape(4, 2)), st.integers(0, 2), st.floats(0, 255, width=32)
+    TagDetection,
+    st.integers(0, 586),
+    vectors(8).map(lambda v: v.reshape(4, 2)),
+    st.integers(0, 2),
+    st.floats(0, 255, width=32),
 )
 tags = st.builds(TagReading, stamps(), st.lists(detections, max_size=4).map(tuple))
 contacts = st.builds(
@@ -129,19 +134,19 @@ def test_a_pose_on_the_bus_is_the_task_planes_embedding(reading: PoseReading) ->
 
 @given(st.one_of(poses(), wrenches))
 def test_the_direct_path_writes_the_bytes_of_a_stock_ros_serialiser(reading: Reading) -> None:
-    stock = get_typestore(Stores.ROS2_HUMBLE)
     type_name = TYPES[type(reading)]
     payload = encode_reading(reading)
-    assert bytes(stock.serialize_cdr(stock.deserialize_cdr(payload, type_name), type_name)) == payload
+    assert bytes(STOCK.serialize_cdr(STOCK.deserialize_cdr(payload, type_name), type_name)) == payload
 
 
 @given(st.one_of(poses(), wrenches))
 def test_big_endian_messages_of_others_are_read(reading: Reading) -> None:
-    stock = get_typestore(Stores.ROS2_HUMBLE)
     type_name = TYPES[type(reading)]
-    message = stock.deserialize_cdr(encode_reading(reading), type_name)
-    swapped = bytes(stock.serialize_cdr(message, type_name, little_endian=False))
-    assert same(decode_reading(type_name, swapped, reading.stamp.sequence, int(reading.stamp.status)), returned(reading))
+    message = STOCK.deserialize_cdr(encode_reading(reading), type_name)
+    swapped = bytes(STOCK.serialize_cdr(message, type_name, little_endian=False))
+    assert same(
+        decode_reading(type_name, swapped, reading.stamp.sequence, int(reading.stamp.status)), returned(reading)
+    )
 
 
 @given(st.sampled_from([*TYPES.values(), messages.COMPRESSED_IMAGE]), st.binary(max_size=300))
@@ -217,9 +222,7 @@ def test_a_tags_homography_takes_its_square_to_its_corners() -> None:
 
 states = st.builds(PlanarState, vectors(3), st.none() | vectors(3), st.none() | vectors(3), vectors(3))
 records = st.one_of(
-    st.builds(
-        WaypointRecord, captures, names, st.integers(0, 10**6), states, vectors(3), states, st.none() | states
-    ),
+    st.builds(WaypointRecord, captures, names, st.integers(0, 10**6), states, vectors(3), states, st.none() | states),
     st.builds(TrialRecord, captures, names, names, names, names, names, names),
     st.builds(PhaseRecord, captures, names, names),
     st.builds(EventRecord, captures, names, names),
@@ -227,7 +230,9 @@ records = st.one_of(
 
 
 @given(records)
-def test_a_record_comes_back_as_it_was_written(record: WaypointRecord | TrialRecord | PhaseRecord | EventRecord) -> None:
+def test_a_record_comes_back_as_it_was_written(
+    record: WaypointRecord | TrialRecord | PhaseRecord | EventRecord,
+) -> None:
     assert same(decode_record(STREAMS[type(record)][1], encode_record(record)), record)
 
 

@@ -110,7 +110,7 @@ def build_trial(controller="closed_loop", eo=False, steps=20, seed=0, error=1.0,
         "skill": skill,
         "controller": controller,
         "status": status,
-        "reason": "" if status == "completed" else "no way-point settled within 3.0 s at way-point 14",
+        "reason": "" if status == "completed" else "no waypoint settled within 3.0 s at waypoint 14",
         "waypoints": {
             "t": times.tolist(),
             "planned": planned,
@@ -213,7 +213,7 @@ def extrinsic():
 
 @pytest.fixture(scope="session")
 def aborted():
-    """A run that a device ended at way-point 6: no truth, holes in what was measured, a log that was cut off."""
+    """A run that a device ended at waypoint 6: no truth, holes in what was measured, a log that was cut off."""
     trial = build_trial(status="device_failed", seed=4)
     way = trial["waypoints"]
     way["t"] = way["t"][:6]
@@ -230,7 +230,7 @@ def aborted():
     row.update(status="device_failed", reason=trial["reason"], measured=None, truth=None)
     run["trials"] = [trial]
     run["results"]["reason"] = "arm: read: no reading within 1 s. Check `extrinsic status STATION`"
-    run["log"].update(lost=12, torn=True)
+    run["log"].update(lost=12, ending="torn at byte 4096: no footer")
     run["events"].append({"t": 8.0, "level": "error", "text": "arm: read: no reading within 1 s"})
     return run
 

@@ -93,6 +93,8 @@ def test_extrinsic_column_appears_only_with_an_extrinsic_object(grasped, extrins
         ("completed", ["device_failed"], "aborted", "device failed"),
         ("stopped", ["stopped"], "aborted", "stopped"),
         ("interrupted", [], "aborted", "no trial was executed"),
+        ("running", ["completed"], "aborted", "cut off while it was running"),
+        ("infeasible", [], "aborted", "infeasible"),
         ("completed", [], "completed", "no trial was executed"),
         (None, ["completed"], "aborted", "does not say how the run ended"),
     ],
@@ -150,7 +152,7 @@ def test_something_that_is_no_mapping_is_refused():
 
 def test_aborted_run_tells_of_its_torn_log_and_its_losses(aborted, find_cells):
     page = render(aborted)
-    assert "cut off before it was closed" in page
+    assert "not closed in order: torn at byte 4096: no footer." in page
     assert '<dd class="bad">12</dd>' in page
     assert find_cells(page, "errors")[0][-4:] == ["–"] * 4
 
@@ -161,6 +163,20 @@ def test_log_reports_size_per_trial_and_mean_rates():
     assert log["per_trial"] == "2.00 MB"
     assert log["topics"] == [("a", "2,000", "100.0"), ("b", "100", "5.0")]
     assert log["total"] == "2,100"
+
+
+@pytest.mark.parametrize(
+    "log", [None, {}, {"file": "log.mcap", "bytes": 0, "messages": {}, "ending": "there is no log"}]
+)
+def test_no_log_is_told_as_no_log(log):
+    assert summary.log_summary(log, 0) is None
+
+
+@pytest.mark.parametrize(("log", "torn"), [({}, False), ({"ending": "complete"}, False), ({"torn": True}, True)])
+def test_only_a_log_that_broke_off_is_called_so(log, torn):
+    found = summary.log_summary({"bytes": 1, "messages": {"a": 1}, **log}, 1)
+    assert found is not None
+    assert bool(found["torn"]) is torn
 
 
 HOSTILE = '</script><script>window.harmed = 1</script><img src=x onerror="window.harmed = 1">&amp;'
@@ -213,21 +229,21 @@ def test_not_finite_poses_become_holes(editable):
     assert trial["playback"]["ee"][5] is None
 
 
-def test_way_points_that_were_not_reached_follow_at_the_usual_step(aborted):
+def test_waypoints_that_were_not_reached_follow_at_the_usual_step(aborted):
     way = payload.build(aborted)["trials"][0]["waypoints"]
     assert way["reached"] == [True] * 6 + [False] * 14
     np.testing.assert_allclose(way["t"], 5.0 + 0.6 * np.arange(20), atol=1e-6)
 
 
-def test_without_a_recording_the_way_points_are_played(editable):
+def test_without_a_recording_the_waypoints_are_played(editable):
     trial = editable["trials"][0]
     trial["playback"] = None
     playback = payload.build(editable)["trials"][0]["playback"]
-    assert playback["source"] == "truth, way-points only"
+    assert playback["source"] == "truth, waypoints only"
     assert playback["t"] == pytest.approx(trial["waypoints"]["t"])
     trial["waypoints"].update(truth=None, measured=None)
     playback = payload.build(editable)["trials"][0]["playback"]
-    assert playback["source"] == "planned, way-points only"
+    assert playback["source"] == "planned, waypoints only"
     assert len(playback["contacts"][0]) == 1
 
 
@@ -263,39 +279,56 @@ def test_many_long_trials_are_thinned_to_stay_under_8_mb(make_run, make_trial):
     assert len(playback["t"]) == len(playback["ee"]) == len(playback["eo"]) == len(playback["contacts"])
 
 
-def test_traces_plot_millimetres_degrees_newtons_and_newton_millimetres(grasped):
-    trial = payload.build(grasped)["trials"][0]
-    figure = traces.figure(trial)
+def test_traces_are_labelled_and_scaled_in_the_units_of_the_paper(grasped):
+    figure = traces.figure(payload.build(grasped)["trials"][0])
     assert figure is not None
-    assert [a.text for a in figure.layout.annotations] == [
+    assert [a["text"] for a in figure["layout"]["annotations"]] == [
         "go x [mm]", "go y [mm]", "go θ [deg]", "ee x [mm]", "ee y [mm]", "ee θ [deg]", "fx [N]", "fy [N]", "τ [N·mm]",
     ]  # fmt: skip
-    planned = [t for t in figure.data if t.meta["role"] == "planned"]
-    assert planned[0].y[0] == pytest.approx(grasped["trials"][0]["waypoints"]["planned"]["go"][0][0] * 1000, abs=1e-3)
-    assert planned[2].y[0] == pytest.approx(10.0, abs=1e-3)
-    assert planned[2].y[-1] == pytest.approx(35.0, abs=1e-3)
-    assert planned[7].y[0] == pytest.approx(-(4.0 - 0.981), abs=1e-6)
-    tau = grasped["trials"][0]["waypoints"]["planned"]["wrench"][0][2]
-    assert planned[8].y[0] == pytest.approx(tau * 1000, abs=1e-3)
+    planned = [t["meta"] for t in figure["data"] if t["meta"]["role"] == "planned"]
+    assert [(m["series"], m["component"]) for m in planned] == [
+        (s, c) for s in ("go", "ee", "wrench") for c in range(3)
+    ]
+    assert [m["factor"] for m in planned] == pytest.approx([1e3, 1e3, 57.29578] * 2 + [1, 1, 1e3])
+    low, high = figure["layout"]["yaxis3"]["range"]
+    assert low < 10.0
+    assert high > 35.0
+
+
+def test_figures_are_figures_to_plotly(grasped, extrinsic):
+    from plotly.graph_objects import Figure
+
+    for run in (grasped, extrinsic):
+        figure = traces.figure(payload.build(run)["trials"][0])
+        assert figure is not None
+        data = [{**traces.styles()[trace["meta"]["role"]], **trace} for trace in figure["data"]]
+        Figure(data=data, layout=figure["layout"])  # refuses what it does not know
+
+
+def test_panels_of_a_figure_do_not_overlap(extrinsic):
+    layout = traces.figure(payload.build(extrinsic)["trials"][0])["layout"]  # pyright: ignore[reportOptionalSubscript]
+    columns = [layout[f"xaxis{n}"]["domain"] for n in ("", "2", "3")]
+    rows = [layout[f"yaxis{n}"]["domain"] for n in ("10", "7", "4", "")]
+    for domains in (columns, rows):
+        edges = [edge for domain in domains for edge in domain]
+        assert edges == sorted(edges)
+        assert edges[0] == pytest.approx(0, abs=1e-5)
+        assert edges[-1] == pytest.approx(1, abs=1e-5)
 
 
 def test_measured_angles_are_drawn_on_the_turn_of_the_plan():
-    way = {
-        "t": [0.0, 1.0],
-        "planned": {"go": [[0, 0, 3.1], [0, 0, 3.2]]},
-        "measured": {"go": [[0, 0, 3.1], [0, 0, -3.08]]},
-    }
-    figure = traces.figure(payload.build({"trials": [{"waypoints": way}]})["trials"][0])
-    assert figure is not None
-    measured = [t for t in figure.data if t.meta["role"] == "measured"][2]
-    assert measured.y[1] == pytest.approx(math.degrees(2 * math.pi - 3.08), abs=1e-3)
+    planned, measured = [[0, 0, 3.1], [0, 0, 3.2]], [[0, 0, 3.1], [0, 0, -3.08]]
+    way = {"t": [0.0, 1.0], "planned": {"go": planned}, "measured": {"go": measured}}
+    found = payload.build({"trials": [{"waypoints": way}]})["trials"][0]["waypoints"]["measured"]["go"]
+    assert found[0][2] == 3.1
+    assert found[1][2] == pytest.approx(2 * math.pi - 3.08, abs=1e-6)
 
 
 def test_a_flat_trace_keeps_an_axis_wide_enough_to_look_flat():
     way = {"t": [0.0, 1.0], "planned": {"go": [[0, 0, 0], [1e-7, 0, 0]]}}
     figure = traces.figure(payload.build({"trials": [{"waypoints": way}]})["trials"][0])
     assert figure is not None
-    low, high = figure.layout.yaxis.range
+    low, high = figure["layout"]["yaxis"]["range"]
     assert high - low >= 1.0
 
 

@@ -1,4 +1,4 @@
-"""Examples of a property may take as long as they take: the machine that runs them has other work."""
+"""What all tests share. Examples of a property may take as long as they take: the machine has other work."""
 
 from hypothesis import HealthCheck, settings
 

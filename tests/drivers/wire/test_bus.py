@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+import zenoh
+
+from drivers.errors import DeviceFault, DeviceTimeout, NotConnected
+from drivers.wire import messages, topics
+from drivers.wire.bus import ATTACHMENT, Bus, Query, Sample, open_buses
+
+
+def until(true: Callable[[], bool], timeout: float = 5.0) -> bool:
+    deadline = time.monotonic() + timeout
+    while not true():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.001)
+    return True
+
+
+def test_what_is_published_arrives_whole_and_in_order(served: Bus, joined: Bus) -> None:
+    publisher = served.publisher("lab/ft/wrench", messages.WRENCH)
+    got: list[Sample] = []
+    subscription = joined.subscribe("lab/ft/wrench")
+    subscription.listen(got.append)
+    assert until(lambda: publisher.matched)
+    for i in range(2000):
+        publisher.put(bytes([i % 256]) * 80, i, 10 * i, 1)
+    assert subscription.wait(1999, None, time.monotonic() + 5)
+    assert [s.sequence for s in got] == list(range(2000))
+    assert all(s.payload == bytes([s.sequence % 256]) * 80 and s.capture_ns == 10 * s.sequence for s in got)
+    assert publisher.count == subscription.count == 2000
+
+
+def test_a_stream_that_nobody_hears_is_not_matched(served: Bus, joined: Bus) -> None:
+    publisher = served.publisher("lab/ft/wrench", messages.WRENCH)
+    assert not publisher.matched
+    stop = joined.subscribe("lab/ft/wrench").listen(lambda _: None)
+    assert until(lambda: publisher.matched)
+    stop()
+    assert until(lambda: not publisher.matched)
+
+
+def test_every_sample_says_its_type(served: Bus, joined: Bus) -> None:
+    publisher = served.publisher("lab/ft/wrench", messages.WRENCH)
+    got: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
+    joined.session.declare_subscriber("lab/**", got.put)
+    assert until(lambda: publisher.matched)
+    publisher.put(b"x", 3, 4)
+    sample = got.get(timeout=5)
+    assert str(sample.encoding) == "application/cdr;geometry_msgs/msg/WrenchStamped"
+    assert sample.attachment is not None
+    assert ATTACHMENT.unpack(sample.attachment.to_bytes()) == (3, 4, 0)
+
+
+def test_a_stream_is_announced_as_the_ros_bridge_announces_its_own(served: Bus, joined: Bus) -> None:
+    publisher = served.publisher("lab/ft/wrench", messages.WRENCH)
+    token = f"@/{served.zid}/@ros2_lv/MP/lab§ft§wrench/geometry_msgs§msg§WrenchStamped/:1::0,10"
+    watch = joined.watch(token)
+    assert watch.seen(5.0)
+    publisher.close()
+    assert watch.wait(5.0)
+
+
+def test_samples_of_others_without_our_attachment_are_counted_not_delivered(served: Bus, joined: Bus) -> None:
+    subscription = joined.subscribe("lab/ft/wrench")
+    got: list[Sample] = []
+    subscription.listen(got.append)
+    publisher = served.session.declare_publisher("lab/ft/wrench")
+    assert until(lambda: publisher.put(b"hello") or subscription.foreign > 0)
+    assert got == []
+
+
+def test_a_request_is_answered(served: Bus, joined: Bus) -> None:
+    served.serve("lab/echo", lambda query: query.reply(query.payload[::-1]))
+    assert joined.request("lab/echo", b"abc", device="lab", asked="echo") == b"cba"
+
+
+def test_a_request_that_nobody_serves_times_out_by_name(joined: Bus) -> None:
+    with pytest.raises(DeviceTimeout, match="gripper: open: nobody serves lab/nothing"):
+        joined.request("lab/nothing", b"", device="gripper", asked="open", timeout=0.1)
+
+
+def test_a_server_that_does_not_answer_times_out(served: Bus, joined: Bus) -> None:
+    kept: list[Query] = []
+    served.serve("lab/slow", kept.append)
+    with pytest.raises(DeviceTimeout, match="no answer in time"):
+        joined.request("lab/slow", b"", device="lab", asked="wait", timeout=0.3)
+
+
+def test_an_empty_answer_is_a_fault(served: Bus, joined: Bus) -> None:
+    served.session.declare_queryable("lab/fails", lambda query: query.drop())
+    with pytest.raises(DeviceFault, match="empty answer"):
+        joined.request("lab/fails", b"", device="lab", asked="fail")
+
+
+def test_a_death_ends_the_request_that_waits_for_it(endpoint: str) -> None:
+    with Bus(endpoint, listen=True, shared_memory=False) as server:
+        asked = threading.Event()
+        kept: list[Query] = []
+
+        def keep(query: Query) -> None:
+            kept.append(query)
+            asked.set()
+
+        server.serve("lab/slow", keep)
+        server.token("lab/slow/alive")
+        with Bus(endpoint, shared_memory=False) as client:
+            watch = client.watch("lab/slow/alive")
+            assert watch.seen(5)
+            closer = threading.Thread(target=lambda: (asked.wait(5), server.close()))
+            closer.start()
+            start = time.monotonic()
+            with pytest.raises(DeviceFault, match="died"):
+                client.request("lab/slow", b"", device="lab", asked="wait", timeout=30, watch=watch)
+            assert time.monotonic() - start < 2.0
+            closer.join()
+            with pytest.raises(DeviceFault, match="died"):
+                client.request("lab/slow", b"", device="lab", asked="wait again", watch=watch)
+
+
+def test_the_first_request_after_opening_is_answered(served: Bus, another: Callable[[], Bus]) -> None:
+    served.serve("lab/echo", lambda query: query.reply(b"here"))
+    for _ in range(5):
+        assert another().request("lab/echo", b"", device="lab", asked="echo") == b"here"
+
+
+def test_closing_twice_is_harmless(endpoint: str) -> None:
+    bus = Bus(endpoint, listen=True, shared_memory=False)
+    publisher, subscription = bus.publisher("a/b/c", messages.STRING), bus.subscribe("a/b/d")
+    bus.close()
+    bus.close()
+    publisher.close()
+    subscription.close()
+
+
+def test_an_abandoned_session_is_told() -> None:
+    with Bus("tcp/127.0.0.1:0", listen=True, shared_memory=False) as bus:
+        assert bus in open_buses()
+    assert bus not in open_buses()
+
+
+def test_nobody_at_the_endpoint_is_told_within_the_timeout(endpoint: str) -> None:
+    start = time.monotonic()
+    with pytest.raises(NotConnected, match=endpoint):
+        Bus(endpoint, timeout=0.5, shared_memory=False)
+    assert time.monotonic() - start < 3
+
+
+def test_a_port_in_use_is_told() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(NotConnected, match="another program"):
+            Bus(f"tcp/127.0.0.1:{taken.getsockname()[1]}", listen=True, shared_memory=False)
+
+
+def test_the_bus_listens_nowhere_but_at_its_endpoint(served: Bus, joined: Bus) -> None:
+    peers = {str(link.src) for link in served.session.info.links()}
+    assert peers == {served.endpoint}
+    assert joined.session.info.peers_zid()
+
+
+def test_keys_are_topic_names() -> None:
+    assert topics.key("lab1", "arm", "pose") == "lab1/arm/pose"
+    assert topics.holder_of(topics.lease("lab1", "arm", "me~1~2")) == "me~1~2"
