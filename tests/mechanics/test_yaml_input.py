@@ -92,7 +92,9 @@ def test_json_is_read_as_json_reads_it(value):
 @given(data)
 def test_plain_yaml_is_read_as_ruamel_reads_it(value):
     out = io.StringIO()
-    YAML(typ="safe", pure=True).dump(value, out)
+    writer = YAML(typ="safe", pure=True)
+    writer.default_flow_style, writer.width = False, 4096  # what ruamel folds or writes in flow it cannot always read
+    writer.dump(value, out)
     assert read_text(out.getvalue(), "x").data == YAML(typ="safe", pure=True).load(out.getvalue())
 
 
