@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 import typer
 from rich.console import Console
@@ -22,6 +24,41 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+Command = TypeVar("Command", bound=Callable[..., None])
+
+
+def command(example: str) -> Callable[[Command], Command]:
+    """Register a command with an example; each way to fail ends with its exit code and one clear message."""
+
+    def register(function: Command) -> Command:
+        @wraps(function)
+        def orderly(*arguments: Any, **options: Any) -> None:
+            from drivers.errors import DriverError
+            from mechanics.yaml_input import InputError
+            from planning.errors import InfeasiblePlan
+
+            try:
+                function(*arguments, **options)
+            except InputError as error:
+                raise _ended(error, ExitCode.BAD_INPUT) from None
+            except InfeasiblePlan as error:
+                raise _ended(error, ExitCode.INFEASIBLE) from None
+            except DriverError as error:
+                raise _ended(error, ExitCode.DEVICE_FAILED) from None
+            except KeyboardInterrupt:
+                raise typer.Exit(ExitCode.INTERRUPTED) from None
+
+        app.command(epilog=f"Example: {example}")(orderly)
+        return function
+
+    return register
+
+
+def _ended(error: Exception, code: ExitCode) -> typer.Exit:
+    sys.stderr.write(f"{error}\n")
+    return typer.Exit(code)
+
+
 Experiment = Annotated[str, typer.Argument(metavar="EXPERIMENT", help="An experiment file, or a shipped one's name.")]
 StationName = Annotated[str, typer.Argument(metavar="STATION", help="A station file, or a shipped one's name.")]
 StationOption = Annotated[
@@ -34,7 +71,7 @@ Sets = Annotated[
 ]
 
 
-@app.command(epilog="Example: extrinsic run grasped_pivoting --set world.stiffness_scale=0.8")
+@command("extrinsic run grasped_pivoting --set world.stiffness_scale=0.8")
 def run(
     experiment: Experiment,
     station: StationOption = None,
@@ -56,7 +93,7 @@ def run(
     raise typer.Exit(outcome.exit_code)
 
 
-@app.command(epilog="Example: extrinsic check experiments/grasped_static.yaml --station sim")
+@command("extrinsic check experiments/grasped_static.yaml --station sim")
 def check(experiment: Experiment, station: StationOption = None, sets: Sets = None) -> None:
     """Validate and resolve an experiment and dry-run its sequence; touches no device."""
     from experiments.check import check as dry_run
@@ -67,7 +104,7 @@ def check(experiment: Experiment, station: StationOption = None, sets: Sets = No
         console.print(line, soft_wrap=True, highlight=False)
 
 
-@app.command(epilog="Example: extrinsic serve sim --set world.clock=realtime")
+@command("extrinsic serve sim --set world.clock=realtime")
 def serve(
     station: StationName,
     devices: Annotated[
@@ -81,11 +118,11 @@ def serve(
 
     config = load_station(station, sets or [], devices or None)
     console = Console(stderr=True)
-    console.print(f"serving {', '.join(config.devices)} at {config.bus.endpoint}; Ctrl-C ends it", highlight=False)
-    raise typer.Exit(serve_simulated(config))
+    what = f"serving {', '.join(config.devices)} at {config.bus.endpoint}; Ctrl-C ends it"
+    raise typer.Exit(serve_simulated(config, lambda _host: console.print(what, highlight=False, soft_wrap=True)))
 
 
-@app.command(epilog="Example: extrinsic status sim")
+@command("extrinsic status sim")
 def status(station: StationName, sets: Sets = None) -> None:
     """Show every device of a station: alive, rate, age, faults."""
     from drivers.status import station_status
@@ -97,7 +134,7 @@ def status(station: StationName, sets: Sets = None) -> None:
     raise typer.Exit(ExitCode.DONE if all(row.alive for row in rows) else ExitCode.DEVICE_FAILED)
 
 
-@app.command(epilog="Example: extrinsic report runs/grasped_pivoting-20260101T120000.000000")
+@command("extrinsic report runs/grasped_pivoting-20260101T120000.000000")
 def report(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
 ) -> None:
@@ -125,23 +162,11 @@ def _check_packages() -> str | None:
 
 
 def main() -> None:
-    """Entry point: bad input ends with 2, a failed device with 3, Ctrl-C with 130, each with one clear message."""
+    """Entry point."""
     problem = _check_packages()
     if problem:
         sys.exit(f"extrinsic: {problem}")
-    from drivers.errors import DriverError
-    from mechanics.yaml_input import InputError
-
-    try:
-        app()
-    except InputError as error:
-        sys.stderr.write(f"{error}\n")
-        sys.exit(ExitCode.BAD_INPUT)
-    except DriverError as error:
-        sys.stderr.write(f"{error}\n")
-        sys.exit(ExitCode.DEVICE_FAILED)
-    except KeyboardInterrupt:
-        sys.exit(ExitCode.INTERRUPTED)
+    app()
 
 
 if __name__ == "__main__":

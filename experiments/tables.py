@@ -44,7 +44,7 @@ def status_table(rows: Sequence[DeviceStatus]) -> Table:
     """One line per device."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for name in ("device", "kind", "backend", "alive"):
-        table.add_column(name)
+        table.add_column(name, no_wrap=True)
     for name in ("rate [Hz]", "age [s]", "gaps"):
         table.add_column(name, justify="right")
     table.add_column("note")

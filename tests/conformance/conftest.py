@@ -161,7 +161,14 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo) -> Itera
     if callspec is None or "opened" not in callspec.params or (report.when != "call" and report.passed):
         return
     kind = callspec.params.get("kind") or getattr(getattr(item, "function", None), "kind", "station")
-    _OUTCOMES.setdefault((kind, callspec.params["opened"]), []).append(report.passed)
+    report.user_properties.append(("conformance", (kind, callspec.params["opened"])))
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    # reports come here from every worker; a worker's own table would be seen by nobody
+    for name, cell in report.user_properties:
+        if name == "conformance" and (report.when == "call" or not report.passed):
+            _OUTCOMES.setdefault(tuple(cell), []).append(report.passed)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:

@@ -2,6 +2,10 @@
 
 import json
 import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
@@ -77,6 +81,23 @@ def test_every_published_message_was_logged(ideal):
     ids = {channel.topic: channel.id for channel in summary.channels.values()}
     for topic, count in account["published"].items():
         assert summary.statistics.channel_message_counts[ids[topic]] == count, topic
+
+
+def test_the_log_opens_in_reruns_loader_with_every_topic(static, tmp_path):
+    rerun = shutil.which("rerun", path=str(Path(sys.executable).parent))
+    assert rerun, "rerun-sdk is a development dependency"
+    converted = subprocess.run(
+        [rerun, "mcap", "convert", "--disable-raw-fallback", "-o", "out.rrd", str(static.folder / "log.mcap")],
+        cwd=tmp_path,
+        env={"HOME": str(tmp_path), "PATH": "/usr/bin:/bin"},  # its settings stay in the test's folder
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert converted.returncode == 0, converted.stderr
+    for topic in static.results["log"]["messages"]:
+        assert f"/{topic}" in converted.stderr, topic
 
 
 def test_the_same_seed_gives_the_same_results(static, shared_command):
