@@ -9,6 +9,7 @@ import socket
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from typing import cast
 
 import pytest
 
@@ -168,7 +169,8 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
     # reports come here from every worker; a worker's own table would be seen by nobody
     for name, cell in report.user_properties:
         if name == "conformance" and (report.when == "call" or not report.passed):
-            _OUTCOMES.setdefault(tuple(cell), []).append(report.passed)
+            kind, backend = cast("tuple[str, str]", cell)
+            _OUTCOMES.setdefault((kind, backend), []).append(report.passed)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
