@@ -23,10 +23,7 @@ class TrialSettings(BaseModel):
     clearance_mm: float = Field(default=10.0, gt=0, le=200, description="height above touch, before and after")
     approach_speed: float = Field(default=0.05, gt=0, le=0.5, description="mean speed of free motions [m/s]")
     touch_speed: float = Field(default=0.01, gt=0, le=0.1, description="mean speed of the descent to touch [m/s]")
-
-    start_tolerance_mm: float = Field(
-        default=5.0, gt=0, description="farthest the go may be from the plan at the start"
-    )
+    start_tolerance_mm: float = Field(default=5.0, gt=0, description="farthest the go may start from the plan")
     start_tolerance_deg: float = Field(default=5.0, gt=0, description="and its angle")
     slip_tolerance_mm: float = Field(default=5.0, gt=0, description="motion of a sticking contact that ends the trial")
     force_limit: float = Field(default=30.0, gt=0, description="measured force that ends the trial [N]")

@@ -19,8 +19,8 @@ def error_table(results: dict[str, Any]) -> Table:
     table.add_column("trial", overflow="fold")
     table.add_column("status")
     table.add_column("seen by")
-    table.add_column("pose [mm]", justify="right", no_wrap=True)
-    table.add_column("wrench [N]", justify="right", no_wrap=True)
+    table.add_column(escape("pose [mm]"), justify="right", no_wrap=True)
+    table.add_column(escape("wrench [N]"), justify="right", no_wrap=True)
     for trial in results["trials"]:
         name, status = escape(trial["name"]), trial["status"]
         style = None if status == "completed" else "yellow"
@@ -46,7 +46,7 @@ def status_table(rows: Sequence[DeviceStatus]) -> Table:
     for name in ("device", "kind", "backend", "alive"):
         table.add_column(name, no_wrap=True)
     for name in ("rate [Hz]", "age [s]", "gaps"):
-        table.add_column(name, justify="right")
+        table.add_column(escape(name), justify="right")
     table.add_column("note")
     for row in rows:
         table.add_row(
