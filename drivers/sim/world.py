@@ -15,10 +15,12 @@ from drivers.interfaces import Device, Sensor
 from drivers.scene import Scene, TagMount
 from drivers.sim.arm import SimArm
 from drivers.sim.device import Simulated
+from drivers.sim.finger import FingerView
 from drivers.sim.force_torque import SimForceTorque
 from drivers.sim.gripper import SimGripper
 from drivers.sim.mismatch import load_profile
 from drivers.sim.plant import ZERO, Plant
+from mechanics import se2
 from mechanics.readings import Array, Stamp, TruthReading
 
 
@@ -29,12 +31,23 @@ def _tag_camera(name: str, config: Any, world: World) -> Device:
     return SimTagCamera(name, config, world)
 
 
+def _tactile(name: str, config: Any, world: World) -> Device:
+    if config.sensor == "soft_bubble":
+        from drivers.sim.soft_bubble import SimSoftBubble
+
+        return SimSoftBubble(name, config, world)
+    from drivers.sim.gelslim import SimGelSlim
+
+    return SimGelSlim(name, config, world)
+
+
 #: how to make each kind of simulated device
 KINDS: dict[str, Callable[[str, Any, World], Device]] = {
     "arm": SimArm,
     "gripper": SimGripper,
     "force_torque": SimForceTorque,
     "tag_camera": _tag_camera,
+    "tactile": _tactile,
 }
 
 
@@ -174,6 +187,14 @@ class World:
                 recoverable=True,
             )
         return self._plant
+
+    def finger_view(self) -> FingerView:
+        """What the fingers feel of the held object at this instant."""
+        plant = self.plant("world", "feel the held object")
+        outline = np.array(self.scene.grasped.vertices, float)
+        X_ee_go = se2.between(plant.ee, plant.go)
+        X_ee_gocf = se2.compose(X_ee_go, np.array(self.scene.grasp))
+        return FingerView(outline, X_ee_go, X_ee_gocf, plant.held)
 
     def visible_tags(self) -> list[tuple[TagMount, Array]]:
         """Every tag with the pose X_W_body (3,) of the body that carries it; the table is at the origin."""
