@@ -65,7 +65,24 @@ class TagCameraConfig(_Device):
     look_at: Vector3
 
 
-DeviceConfig = Annotated[ArmConfig | GripperConfig | ForceTorqueConfig | TagCameraConfig, Field(discriminator="kind")]
+class TactileConfig(_Device):
+    """A tactile finger. The ``left`` finger looks along +Y at the task plane, the ``right`` one along −Y.
+
+    ``indentation`` [m] is how deep the held object's face is pressed into the membrane or gel.
+    """
+
+    kind: Literal["tactile"]
+    sensor: Literal["soft_bubble", "gelslim"]
+    finger: Literal["left", "right"]
+    rate: float = Field(default=30.0, gt=0, le=60)
+    width: int = Field(default=224, ge=32, le=1280)
+    height: int = Field(default=171, ge=32, le=960)
+    indentation: float = Field(default=0.012, gt=0, le=0.03)
+
+
+DeviceConfig = Annotated[
+    ArmConfig | GripperConfig | ForceTorqueConfig | TagCameraConfig | TactileConfig, Field(discriminator="kind")
+]
 
 
 class LogConfig(Strict):
