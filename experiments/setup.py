@@ -12,6 +12,7 @@ from experiments.schema import PlanStage
 from mechanics import se2
 from mechanics.camera import TagGeometry
 from mechanics.elasticity import Elasticity
+from planning.skills.base import Held
 from planning.task import Task
 
 GRAVITY = 9.81
@@ -62,12 +63,12 @@ def scene(resolved: Resolved) -> Scene:
 
 def task(resolved: Resolved, stage: PlanStage) -> Task:
     """What the planner is asked for. Raises ValueError naming the parameter that the geometry does not allow."""
-    return registries.skills()[stage.skill].task(
-        stage.skill_parameters,
-        polygon_vertices=resolved.grasped.polygon.vertices,
+    held = Held(
+        vertices=resolved.grasped.polygon.vertices,
         mass=resolved.grasped.mass,
         grasp=resolved.grasp,
         stiffness=resolved.sensor.stiffness,
         mu=resolved.friction["go-ground"],
         gravity=GRAVITY,
     )
+    return registries.skills()[stage.skill].task(stage.skill_parameters, held)

@@ -3,20 +3,48 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PositiveFloat
 
 from mechanics.readings import Array
-from planning.task import Task
+from planning.task import ContactRequest, Task
 
 
 class SkillParameters(BaseModel):
     """What the user of a skill may choose: frozen, unknown keys rejected."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """The grasped object in the fingers, and what it stands on.
+
+    ``vertices`` (V, 2) [m] in the go's frame, whose origin is its centre of mass; ``mass`` [kg]; ``grasp`` (3,)
+    X_go_gocf; ``stiffness`` (3, 3) [N/m, N, N·m/rad] in gocf; ``mu`` of go on ground; ``gravity`` [m/s²]. Raises
+    ValueError naming the field that does not fit.
+    """
+
+    vertices: Array
+    mass: float
+    grasp: Array
+    stiffness: Array
+    mu: float
+    gravity: float = 9.81
+
+    def __post_init__(self) -> None:
+        for name in ("vertices", "grasp", "stiffness"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
+        shape = self.vertices.shape
+        if len(shape) != 2 or shape[1] != 2 or shape[0] < 3 or not np.isfinite(self.vertices).all():
+            raise ValueError(f"vertices: expected three or more finite (x, y), received shape {shape}")
+
+    def task(self, skill: str, go: Array, contacts: tuple[ContactRequest, ...]) -> Task:
+        """The task of a skill that moves this object along ``go`` (K, 3) in ``contacts``."""
+        return Task(skill, go, contacts, self.grasp, self.mass, self.stiffness, gravity=self.gravity)
 
 
 class Skill(ABC):
@@ -27,22 +55,8 @@ class Skill(ABC):
 
     @staticmethod
     @abstractmethod
-    def task(
-        parameters: Any,
-        *,
-        polygon_vertices: Sequence[Sequence[float]] | Array,
-        mass: float,
-        grasp: Sequence[float] | Array,
-        stiffness: Sequence[Sequence[float]] | Array,
-        mu: float,
-        gravity: float = 9.81,
-    ) -> Task:
-        """Return the task.
-
-        ``polygon_vertices`` (V, 2) [m] in the go's frame, whose origin is its centre of mass; ``mass`` [kg];
-        ``grasp`` (3,) X_go_gocf; ``stiffness`` (3, 3) [N/m, N, N·m/rad] in gocf; ``mu`` go on ground; ``gravity``
-        [m/s²]. Raises ValueError naming the parameter that the geometry does not allow.
-        """
+    def task(parameters: Any, held: Held) -> Task:
+        """Return the task. Raises ValueError naming the parameter that the geometry does not allow."""
 
 
 SKILLS: dict[str, type[Skill]] = {}

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from mechanics.readings import Array
 from planning.skills import stance
-from planning.skills.base import PositiveRamp, Skill, SkillParameters, ramp, register
+from planning.skills.base import Held, PositiveRamp, Skill, SkillParameters, ramp, register
 from planning.task import Task
 
 Angle = Annotated[float, Field(ge=-180, le=180)]
@@ -38,27 +36,10 @@ class GraspedPivoting(Skill):
     Parameters: ClassVar[type[SkillParameters]] = PivotingParameters
 
     @staticmethod
-    def task(
-        parameters: PivotingParameters,
-        *,
-        polygon_vertices: Sequence[Sequence[float]] | Array,
-        mass: float,
-        grasp: Sequence[float] | Array,
-        stiffness: Sequence[Sequence[float]] | Array,
-        mu: float,
-        gravity: float = 9.81,
-    ) -> Task:
+    def task(parameters: PivotingParameters, held: Held) -> Task:
         """Return the task; see `planning.skills.base.Skill.task`."""
-        vertices = stance.checked_vertices(polygon_vertices)
         theta = np.deg2rad(ramp(parameters.angle_deg, parameters.steps))
-        corner = stance.pivot_corner(vertices, theta)
+        corner = stance.pivot_corner(held.vertices, theta)
         force = np.column_stack([ramp(parameters.force, len(theta)), np.zeros(len(theta))])
-        return Task(
-            skill=GraspedPivoting.name,
-            go=stance.standing_pose(corner, theta, parameters.contact_x),
-            contacts=stance.sticking_ground_contacts(corner[None], mu, force),
-            X_go_gocf=np.asarray(grasp, dtype=np.float64),
-            mass=mass,
-            stiffness=np.asarray(stiffness, dtype=np.float64),
-            gravity=gravity,
-        )
+        go = stance.standing_pose(corner, theta, parameters.contact_x)
+        return held.task(GraspedPivoting.name, go, stance.sticking_ground_contacts(corner[None], held.mu, force))

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
 from pydantic import Field
 
-from mechanics.readings import Array
 from planning.skills import stance
-from planning.skills.base import PositiveRamp, Ramp, Skill, SkillParameters, ramp, register
+from planning.skills.base import Held, PositiveRamp, Ramp, Skill, SkillParameters, ramp, register
 from planning.task import Task
 
 
@@ -37,27 +35,10 @@ class GraspedStatic(Skill):
     Parameters: ClassVar[type[SkillParameters]] = StaticParameters
 
     @staticmethod
-    def task(
-        parameters: StaticParameters,
-        *,
-        polygon_vertices: Sequence[Sequence[float]] | Array,
-        mass: float,
-        grasp: Sequence[float] | Array,
-        stiffness: Sequence[Sequence[float]] | Array,
-        mu: float,
-        gravity: float = 9.81,
-    ) -> Task:
+    def task(parameters: StaticParameters, held: Held) -> Task:
         """Return the task; see `planning.skills.base.Skill.task`."""
-        vertices = stance.checked_vertices(polygon_vertices)
         theta = np.full(parameters.steps, np.deg2rad(parameters.angle_deg))
-        points = stance.lowest_points(vertices, theta[0])
+        points = stance.lowest_points(held.vertices, theta[0])
         force = np.column_stack([ramp(parameters.force, len(theta)), ramp(parameters.tangential, len(theta))])
-        return Task(
-            skill=GraspedStatic.name,
-            go=stance.standing_pose(points[0], theta, parameters.contact_x),
-            contacts=stance.sticking_ground_contacts(points, mu, force),
-            X_go_gocf=np.asarray(grasp, dtype=np.float64),
-            mass=mass,
-            stiffness=np.asarray(stiffness, dtype=np.float64),
-            gravity=gravity,
-        )
+        go = stance.standing_pose(points[0], theta, parameters.contact_x)
+        return held.task(GraspedStatic.name, go, stance.sticking_ground_contacts(points, held.mu, force))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from mechanics import se2
@@ -15,14 +13,6 @@ LEVEL = 1e-6
 """Vertices this close in height [m] are equally low."""
 
 GROUND_NORMAL = (0.0, 1.0)
-
-
-def checked_vertices(polygon_vertices: Sequence[Sequence[float]] | Array) -> Array:
-    """Return the vertices (V, 2). Raises ValueError unless there are three or more, finite."""
-    vertices = np.asarray(polygon_vertices, dtype=np.float64)
-    if vertices.ndim != 2 or vertices.shape[1] != 2 or len(vertices) < 3 or not np.isfinite(vertices).all():
-        raise ValueError(f"polygon_vertices: expected three or more finite (x, y), received shape {vertices.shape}")
-    return vertices
 
 
 def lowest_points(vertices: Array, theta: float) -> Array:

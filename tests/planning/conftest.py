@@ -5,22 +5,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from planning.skills.base import Held
+
 BUBBLE_PRINTED = np.array([[2208.96, -143.31, 399.86], [-143.31, 1875.92, -313.57], [399.86, -313.57, 1608.49]])
 RHO = 0.0448
 
 
 @pytest.fixture(scope="session")
 def tall_box():
-    """Keyword arguments of every skill's ``task``."""
+    """tall_box in the soft bubble."""
     s = np.diag([1, 1, RHO])
-    return {
-        "polygon_vertices": np.array([[-25, -73.45], [25, -73.45], [25, 73.45], [-25, 73.45]]) * 1e-3,
-        "mass": 0.1,
-        "grasp": (0.0, 0.045, 0.0),
-        "stiffness": s @ BUBBLE_PRINTED @ s,
-        "mu": 0.33,
-        "gravity": 9.81,
-    }
+    return Held(
+        vertices=np.array([[-25, -73.45], [25, -73.45], [25, 73.45], [-25, 73.45]]) * 1e-3,
+        mass=0.1,
+        grasp=np.array([0.0, 0.045, 0.0]),
+        stiffness=s @ BUBBLE_PRINTED @ s,
+        mu=0.33,
+    )
 
 
 @pytest.fixture(scope="session")

@@ -18,7 +18,7 @@ from planning.task import ContactRequest, Task
 
 def made(name, tall_box, **parameters):
     skill = SKILLS[name]
-    return skill.task(skill.Parameters(**parameters), **tall_box)
+    return skill.task(skill.Parameters(**parameters), tall_box)
 
 
 @pytest.fixture(params=["grasped_static", "grasped_pivoting"])
