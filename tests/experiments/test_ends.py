@@ -8,6 +8,9 @@ import time
 import pytest
 from mcap.reader import make_reader
 
+from drivers.station import Station
+from experiments.files import load_station
+
 
 def wait_for_line(process, part, timeout=60):
     """Read the run's standard error until a line has ``part``: the event to act on."""
@@ -40,6 +43,24 @@ def test_ctrl_c_closes_in_order(command, moment):
     topics = topics_of(finished.folder / "log.mcap")
     assert "run/event" in topics
     assert (finished.folder / "report.html").exists()
+
+
+def test_ctrl_c_leaves_the_arm_held_and_free_for_the_next(command):
+    host = command.start("serve", "sim", "--set", f"bus.endpoint={command.endpoint}")
+    wait_for_line(host, "serving")
+    process = command.start_run("grasped_static")
+    wait_for_line(process, "open_loop")
+    process.send_signal(signal.SIGINT)
+    assert command.finish(process).code == 130
+    with Station(load_station("sim", [f"bus.endpoint={command.endpoint}"])).connect() as devices:
+        devices.clock.sleep(0.1)
+        before = devices.arm.latest()
+        devices.clock.sleep(0.5)
+        after = devices.arm.latest()
+        assert after.stamp.capture_ns > before.stamp.capture_ns
+        assert after.pose == pytest.approx(before.pose, abs=0)
+        devices.arm.acquire("next")
+        devices.arm.release()
 
 
 def test_a_second_ctrl_c_does_not_cut_the_closing_short(command):
