@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +11,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from drivers.status import DeviceStatus
+from experiments.paper import beside
+
+FIGURES = ("go_pose_mm", "wrench_N")
 
 
 def error_table(results: dict[str, Any]) -> Table:
@@ -21,19 +25,45 @@ def error_table(results: dict[str, Any]) -> Table:
     table.add_column("seen by")
     table.add_column(escape("pose [mm]"), justify="right", no_wrap=True)
     table.add_column(escape("wrench [N]"), justify="right", no_wrap=True)
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for trial in results["trials"]:
-        name, status = escape(trial["name"]), trial["status"]
-        style = None if status == "completed" else "yellow"
-        for witness in ("measured", "truth"):
-            figures = trial[witness]
-            if figures is None and witness == "truth":
-                continue
-            cells = [_cell((figures or {}).get(key)) for key in ("go_pose_mm", "wrench_N")]
-            table.add_row(name, status, witness, *cells, style=style)
-            name = status = ""
+        groups.setdefault((trial["skill"], trial["controller"]), []).append(trial)
+        style = None if trial["status"] == "completed" else "yellow"
+        _rows(table, escape(trial["name"]), trial["status"], [trial], style)
     if not results["trials"]:
         table.add_row("no trial was run", results["status"])
+    paper = beside(results["trials"])["rows"]
+    for (skill, controller), group in groups.items():
+        printed = paper.get(group[0]["name"])
+        if len(group) == 1 and printed is None:
+            continue
+        table.add_section()
+        if len(group) > 1:
+            completed = sum(trial["status"] == "completed" for trial in group)
+            _rows(table, f"{skill}, {controller}", f"{completed} of {len(group)}", group, "bold")
+        if printed is not None:
+            name = f"{skill}, {controller}" if len(group) == 1 else ""
+            table.add_row(name, "", "paper", *(_cell(printed[key]) for key in FIGURES), style="dim")
     return table
+
+
+def _rows(table: Table, name: str, status: str, trials: list[dict[str, Any]], style: str | None) -> None:
+    """A row for each witness: one trial's figures, or mean and spread over the trials' means."""
+    for witness in ("measured", "truth"):
+        seen = [trial[witness] for trial in trials if trial[witness] is not None]
+        if not seen and witness == "truth":
+            continue
+        cells = [_cell(_over([figures.get(key) for figures in seen])) for key in FIGURES]
+        table.add_row(name, status, witness, *cells, style=style)
+        name = status = ""
+
+
+def _over(figures: list[dict[str, float] | None]) -> dict[str, float] | None:
+    known = [figure for figure in figures if figure is not None]
+    if len(known) < 2:
+        return known[0] if known else None
+    means = [figure["mean"] for figure in known]
+    return {"mean": statistics.fmean(means), "std": statistics.pstdev(means)}
 
 
 def _cell(figure: dict[str, float] | None) -> str:

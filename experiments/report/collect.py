@@ -12,6 +12,7 @@ import numpy as np
 from drivers.errors import ProtocolError
 from drivers.wire.log_reader import LogReader
 from experiments.files import load
+from experiments.paper import beside
 from experiments.run_folder import RunFolder
 from mechanics import se2
 from mechanics.readings import TruthReading
@@ -67,7 +68,7 @@ def collect(folder: RunFolder) -> dict[str, Any]:
             "ending": log.ending,
         },
         "events": [{"t": event.capture_ns * SECOND, "level": event.level, "text": event.text} for event in log.events],
-        "paper": None,
+        "paper": beside(results.get("trials", [])),
     }
 
 

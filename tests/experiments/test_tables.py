@@ -1,0 +1,54 @@
+"""The terminal's tables: ours beside the paper's, whole at 80 columns."""
+
+import pytest
+from rich.console import Console
+
+from experiments.paper import beside, tables
+from experiments.tables import error_table
+
+
+def trial(controller, number=0, pose=2.0, skill="grasped_pivoting"):
+    figures = {"go_pose_mm": {"mean": pose, "std": 0.1}, "wrench_N": {"mean": 1.5, "std": 0.2}}
+    name = f"pivot-{controller}-{number}"
+    row = {"name": name, "skill": skill, "controller": controller, "status": "completed", "measured": figures}
+    return row | {"truth": figures}
+
+
+def shown(trials):
+    console = Console(width=80, record=True, force_terminal=False)
+    console.print(error_table({"experiment": "e", "station": "s", "seed": 0, "status": "done", "trials": trials}))
+    return console.export_text()
+
+
+@pytest.mark.parametrize(
+    ("skill", "controller", "wrench", "pose"),
+    [  # Table 1 of the paper
+        ("static", "open_loop", 0.75, 1.35),
+        ("pivoting", "closed_loop_pi", 0.64, 0.48),
+        ("sliding", "rigid_sensor", 0.79, 0.78),
+    ],
+)
+def test_the_papers_figures_are_those_it_prints(skill, controller, wrench, pose):
+    row = tables().grasped[skill][controller]
+    assert (row.wrench_N[0], row.go_pose_mm[0]) == (wrench, pose)
+
+
+def test_the_paper_stands_beside_what_it_measured_and_nothing_else():
+    assert set(beside([trial("open_loop"), trial("mine")])["rows"]) == {"pivot-open_loop-0"}
+    assert beside([trial("open_loop", skill="static")])["rows"] == {}
+
+
+def test_units_and_figures_are_whole_at_80_columns():
+    text = shown([trial("open_loop")])
+    assert "pose [mm]" in text and "wrench [N]" in text
+    assert "2.000 ± 0.100" in text and "1.860 ± 0.230" in text
+
+
+def test_several_trials_end_with_the_mean_of_their_means_and_its_spread():
+    text = shown([trial("open_loop", 0, 1.0), trial("open_loop", 1, 3.0)])
+    assert "2 of 2" in text
+    assert "2.000 ± 1.000" in text
+
+
+def test_a_run_without_trials_says_so():
+    assert "no trial was run" in shown([])
