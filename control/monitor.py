@@ -24,13 +24,16 @@ class Deviation:
 class ContactMonitor:
     """Watches the planned contacts of the go at the waypoints.
 
-    ``load`` is the fraction of the planned contact force below which a contact counts as lost.
+    ``load`` is the fraction of the planned contact force below which a contact counts as lost. ``lies`` (3,) is the
+    pose of the go as it was seen before touch-down, in the frame of where the plan has it: a contact that lands
+    elsewhere because the go lies otherwise in the fingers has not slipped, it has to stick where it landed.
     """
 
     plan: Plan
     slip_tolerance: float
     force_limit: float
     load: float = 0.1
+    lies: Array | None = None
 
     def check(self, step: int, measured: PlanarState, weight: Array) -> Deviation | None:
         """The deviation at waypoint ``step``, or None. ``weight`` (2,) [N] is the force of gravity on the go in W."""
@@ -59,9 +62,18 @@ class ContactMonitor:
                 continue
             planned = self.plan.contact_points[step, c]
             body_point = se2.transform(se2.inverse(self.plan.go[step]), planned)
-            moved = float(np.linalg.norm(se2.transform(go, body_point) - planned))
+            stood = planned + self._landed(step, c, body_point)
+            moved = float(np.linalg.norm(se2.transform(go, body_point) - stood))
             if moved > self.slip_tolerance:
                 return Deviation(
                     "slipped", f"waypoint {step}: contact '{name}' is {moved * 1e3:.1f} mm from where it should stick"
                 )
         return None
+
+    def _landed(self, step: int, contact: int, body_point: Array) -> Array:
+        """How far (2,) along the surface, in W, the contact landed from where the plan has it."""
+        if self.lies is None:
+            return np.zeros(2)
+        off = se2.rotate(self.plan.go[0, 2], se2.transform(self.lies, body_point) - body_point)
+        normal = self.plan.contact_normals[step, contact]
+        return off - (off @ normal) * normal

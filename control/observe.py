@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 
-from drivers.errors import DeviceTimeout
+from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import Arm, ForceTorqueSensor, TagCamera
 from estimation.force_torque import FreeAirLoad, WristSensor, mean_wrench
 from estimation.tag_pose import TagPose, estimate_planar_pose
 from mechanics import se2
 from mechanics.camera import CameraModel, TagGeometry
-from mechanics.readings import Array, TagDetection
+from mechanics.readings import Array, Status, TagDetection
 from mechanics.records import PlanarState
 
 
@@ -37,11 +38,22 @@ class Observer:
     def see(self, bodies: tuple[str, ...]) -> dict[str, TagPose | None]:
         """Poses in W of the named bodies from fresh camera frames; None where none of its tags was seen."""
         detections: list[TagDetection] = []
-        for _ in range(self.frames):
-            detections += self.camera.capture().detections
+        frames = [self.camera.capture() for _ in range(self.frames)]
+        trusted = [frame for frame in frames if frame.stamp.status is Status.OK]
+        if not trusted:
+            _distrust(self.camera.name, "see the tags", frames[-1].stamp.status)
+        for frame in trusted:
+            detections += frame.detections
         return {
             body: estimate_planar_pose(self.camera_model, tuple(detections), self.tags.get(body, ())) for body in bodies
         }
+
+    def arm_pose(self) -> Array:
+        """X_W_ee (3,) now. Raises DeviceFault where the arm's own reading is not to be trusted."""
+        reading = self.arm.latest()
+        if reading.stamp.status is not Status.OK:
+            _distrust(self.arm.name, "read its pose", reading.stamp.status)
+        return reading.pose
 
     def mean_reading(self) -> Array:
         """Mean (6,) of the wrist readings of the last window."""
@@ -56,16 +68,20 @@ class Observer:
 
     def measure(self) -> PlanarState:
         """Everything at this instant; the arm should be at rest."""
-        ee = self.arm.latest()
+        ee = self.arm_pose()
         reading = self.mean_reading()
         seen = self.see(("go", "eo"))
         go = None if seen["go"] is None else seen["go"].pose
         eo = None if seen["eo"] is None else seen["eo"].pose
-        grasp_centre = se2.compose(ee.pose if go is None else go, np.zeros(3) if go is None else self.grasp)
-        wrench = self.wrist_sensor.wrench_on_go(reading, ee.pose, grasp_centre[:2])
-        return PlanarState(ee.pose, go, eo, wrench)
+        grasp_centre = se2.compose(ee if go is None else go, np.zeros(3) if go is None else self.grasp)
+        wrench = self.wrist_sensor.wrench_on_go(reading, ee, grasp_centre[:2])
+        return PlanarState(ee, go, eo, wrench)
 
     def zero(self, load: FreeAirLoad, X_W_go: Array) -> None:
         """Take the wrist sensor's offset in free air, with the go at ``X_W_go`` and only its weight on the sensor."""
-        ee = self.arm.latest().pose
+        ee = self.arm_pose()
         self.wrist_sensor = self.wrist_sensor.zeroed(self.mean_reading(), ee, X_W_go, self.grasp, load)
+
+
+def _distrust(device: str, asked: str, status: Status) -> NoReturn:
+    raise DeviceFault(device, asked, f"its readings are {status.name.lower()}", "See to the device, then run again")

@@ -15,7 +15,7 @@ from control.monitor import ContactMonitor
 from control.motion import Mover
 from control.observe import Observer
 from control.settings import TrialSettings
-from drivers.errors import CommandRefused, DriverError
+from drivers.errors import CommandRefused, DriverError, SimulationDiverged
 from drivers.interfaces import Clock
 from estimation.force_torque import FreeAirLoad
 from mechanics import se2
@@ -72,11 +72,15 @@ class Trial:
         self._settings, self._watch = settings, watch
         self._result = TrialResult("completed", "", plan)
         self._mover = Mover(
-            observer.arm, clock, settings.control_rate, observer.arm.latest().pose, settings.approach_speed, watch.tick
+            observer.arm, clock, settings.control_rate, observer.arm_pose(), settings.approach_speed, watch.tick
         )
 
     def run(self) -> TrialResult:
-        """Run the whole protocol. A device failure ends it ``device_failed``, a refusal or a limit ``stopped``."""
+        """Run the whole protocol. Returns how it ended.
+
+        A device failure ends it ``device_failed``, a refusal or a limit ``stopped``, and a simulation whose state has
+        become nonsense ``diverged``.
+        """
         result = self._result
         try:
             self._protocol()
@@ -85,6 +89,8 @@ class Trial:
             self._leave()
         except CommandRefused as error:
             result.status, result.reason = "stopped", str(error)
+        except SimulationDiverged as error:
+            result.status, result.reason = "diverged", str(error)
         except DriverError as error:
             result.status, result.reason = "device_failed", str(error)
         if result.status != "completed":
@@ -102,7 +108,8 @@ class Trial:
         plan = self._anchored(go_air)
         self._result.plan = plan
         controller = self._make_controller(plan)
-        monitor = ContactMonitor(plan, s.slip_tolerance_mm * 1e-3, s.force_limit)
+        lies = None if controller.feedback else se2.between(go_air, self._go_seen)
+        monitor = ContactMonitor(plan, s.slip_tolerance_mm * 1e-3, s.force_limit, lies=lies)
 
         go_air = self._lifted(plan.preload_go[0])
         ee_air = plan.free_air_ee(go_air)
@@ -168,6 +175,7 @@ class Trial:
             raise _Ended("stopped", f"the start could not be verified: {problem}")
         table, go = seen["table"], seen["go"]
         assert table is not None and go is not None  # _start_problem saw both
+        self._go_seen = go.pose
         self._observer.zero(self._load, go.pose)
         return self._nominal.reanchored(table.pose)
 

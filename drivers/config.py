@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from drivers.fault import Fault
 from drivers.scene import Strict, TagMount, Vector3
+from mechanics.yaml_input import Refusal
 
 
 class WorldConfig(Strict):
@@ -16,6 +18,7 @@ class WorldConfig(Strict):
     stiffness_scale: float = Field(default=1.0, gt=0, description="the plant's stiffness over the planner's")
     clock: Literal["lockstep", "realtime"] = "lockstep"
     timestep: float = Field(default=0.001, gt=0, le=0.002, description="plant step [s]")
+    faults: tuple[Fault, ...] = Field(default=(), description="what goes wrong, counted from each reset")
 
 
 class BusConfig(Strict):
@@ -65,10 +68,14 @@ class TagCameraConfig(_Device):
     look_at: Vector3
 
 
+def _usual_indentation(given: dict[str, Any]) -> float:
+    return 0.0008 if given.get("sensor") == "gelslim" else 0.012
+
+
 class TactileConfig(_Device):
     """A tactile finger. The ``left`` finger looks along +Y at the task plane, the ``right`` one along −Y.
 
-    ``indentation`` [m] is how deep the held object's face is pressed into the membrane or gel.
+    ``indentation`` [m] is how deep the held object's face is pressed into the membrane (usually 12 mm) or gel (0.8 mm).
     """
 
     kind: Literal["tactile"]
@@ -77,7 +84,7 @@ class TactileConfig(_Device):
     rate: float = Field(default=30.0, gt=0, le=60)
     width: int = Field(default=224, ge=32, le=1280)
     height: int = Field(default=171, ge=32, le=960)
-    indentation: float = Field(default=0.012, gt=0, le=0.03)
+    indentation: float = Field(default_factory=_usual_indentation, gt=0, le=0.03)
 
 
 DeviceConfig = Annotated[
@@ -101,3 +108,14 @@ class StationConfig(Strict):
     devices: dict[str, DeviceConfig]
     table_tags: tuple[TagMount, ...] = ()
     log: LogConfig = LogConfig()
+
+    @model_validator(mode="after")
+    def _faults_suit(self) -> Self:
+        kinds = {name: device.kind for name, device in self.devices.items()}
+        for i, fault in enumerate(self.world.faults if self.world is not None else ()):
+            try:
+                fault.suit(kinds)
+            except Refusal as refusal:
+                refusal.at = ("world", "faults", i, *refusal.at)
+                raise
+        return self

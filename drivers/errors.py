@@ -55,5 +55,9 @@ class DeviceFault(DriverError):
         self.recoverable = recoverable
 
 
+class SimulationDiverged(DeviceFault):
+    """The simulated world's state has become nonsense; it stays so until its next reset."""
+
+
 class ProtocolError(DriverError):
     """Bytes arrived that mean nothing."""

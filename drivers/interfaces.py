@@ -7,14 +7,19 @@ arm held. Readings are buffered by the device (bounded, oldest dropped) in the o
 from __future__ import annotations
 
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
-from drivers.errors import DeviceTimeout, NotConnected
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.errors import DeviceTimeout, NotConnected, ProtocolError
+from drivers.fault import Fault
 from mechanics.readings import (
     Array,
     GripperReading,
@@ -37,7 +42,7 @@ class Clock(Protocol):
         ...
 
     def sleep(self, seconds: float) -> None:
-        """Let ``seconds`` of station time pass. On return every reading captured until then has been received.
+        """Let ``seconds`` of station time pass. On return every reading that a device gave out until then is here.
 
         Raises DeviceFault within 2 s when the station has died meanwhile.
         """
@@ -118,67 +123,139 @@ class Device(ABC):
     def _shut(self) -> None: ...
 
 
+def freshness(rate: float) -> float | None:
+    """How old the newest reading of a stream of ``rate`` [Hz] may be [s]; None where readings come on request only."""
+    return max(5.0 / rate, 0.1) if rate > 0 else None
+
+
 class Sensor(Device, Generic[R]):
-    """A device that produces readings. Backends call `_push` for each, from any thread."""
+    """A device that produces readings. Backends call `_push` for each, from any thread.
+
+    ``max_age`` [s] is how old, in station time, a reading may be that `latest` returns; connecting sets it to the
+    `freshness` of the described rate. None: any age.
+    """
+
+    max_age: float | None = None
 
     def __init__(self, name: str, buffer: int = 4096):
         super().__init__(name)
         self._readings: deque[R] = deque(maxlen=buffer)
         self._arrived = threading.Condition()
-        self._gaps = 0
+        self._gaps = self._corrupt = 0
         self._last_sequence: int | None = None
+        self._damaged: Stamp | None = None  # of the newest message, where it could not be read
         self._listeners: tuple[Callable[[R], None], ...] = ()
+        self._mourners: tuple[Callable[[Stamp], None], ...] = ()
 
-    def listen(self, callback: Callable[[R], None]) -> Callable[[], None]:
+    def listen(
+        self, callback: Callable[[R], None], damaged: Callable[[Stamp], None] | None = None
+    ) -> Callable[[], None]:
         """Call ``callback`` with each reading as it arrives, in the thread that delivers it; returns the way to stop.
 
-        A listener only appends or publishes; one that blocks holds up the device.
+        ``damaged`` is called with the stamp of each message that could not be read. A listener only appends or
+        publishes; one that blocks holds up the device.
         """
         with self._arrived:
             self._listeners = (*self._listeners, callback)
+            if damaged is not None:
+                self._mourners = (*self._mourners, damaged)
 
         def stop() -> None:
             with self._arrived:
                 self._listeners = tuple(c for c in self._listeners if c is not callback)
+                self._mourners = tuple(c for c in self._mourners if c is not damaged)
 
         return stop
 
     def _push(self, reading: R) -> None:
         with self._arrived:
-            last, sequence = self._last_sequence, reading.stamp.sequence
-            if last is not None and sequence > last + 1:
-                self._gaps += sequence - last - 1
-            self._last_sequence = sequence
+            self._arrive(reading.stamp)
+            self._damaged = None
             self._readings.append(reading)
             self._arrived.notify_all()
             listeners = self._listeners
         for listener in listeners:
             listener(reading)
 
+    def _push_damaged(self, stamp: Stamp) -> None:
+        """A message came that cannot be read; ``stamp`` is what is known of it."""
+        with self._arrived:
+            self._arrive(stamp)
+            self._damaged = stamp
+            self._corrupt += 1
+            self._arrived.notify_all()
+            mourners = self._mourners
+        for mourner in mourners:
+            mourner(stamp)
+
+    def _arrive(self, stamp: Stamp) -> None:
+        last = self._last_sequence
+        if last is not None and stamp.sequence > last + 1:
+            self._gaps += stamp.sequence - last - 1
+        self._last_sequence = stamp.sequence
+
     def _forget(self) -> None:
         """Drop what was buffered (a new epoch: the world was reset, or the device reconnected)."""
         with self._arrived:
             self._readings.clear()
-            self._last_sequence = None
-            self._gaps = 0
+            self._last_sequence = self._damaged = None
+            self._gaps = self._corrupt = 0
 
     @property
     def gaps(self) -> int:
         """Readings lost between the source and here since connecting, by sequence number."""
         return self._gaps
 
+    @property
+    def corrupt(self) -> int:
+        """Messages that arrived since connecting and could not be read."""
+        return self._corrupt
+
     def latest(self, timeout: float = 1.0) -> R:
-        """The newest reading; waits for the first one. Raises DeviceTimeout after ``timeout`` wall seconds."""
+        """The newest reading; waits for one that is not older than `max_age`.
+
+        Raises DeviceTimeout after ``timeout`` wall seconds (at once in lockstep, where a silent device stays silent
+        while somebody waits), ProtocolError when the newest message could not be read.
+        """
         self._need_connection("read")
+
+        def newest() -> int | None:
+            if self._damaged is not None:
+                return self._damaged.capture_ns
+            return self._readings[-1].stamp.capture_ns if self._readings else None
+
         with self._arrived:
-            if not self._arrived.wait_for(lambda: len(self._readings) > 0, timeout):
-                raise DeviceTimeout(
-                    self.name, "read", f"no reading within {timeout:g} s", "Check `extrinsic status STATION`"
-                )
+            self._await(newest, timeout)
+            if self._damaged is not None:
+                raise ProtocolError(self.name, "read", "the newest message is damaged", "See to its cable")
             return self._readings[-1]
 
+    def _station_ns(self) -> int | None:
+        """The station's time, by which readings age; None for a device that knows none."""
+        return None
+
+    #: whether station time stands still while somebody waits
+    _still = False
+
+    def _await(
+        self, newest: Callable[[], int | None], timeout: float, check: Callable[[], object] = lambda: None
+    ) -> None:
+        """Wait, holding `_arrived`, until what is ``newest`` [ns] is fresh; ``check`` may raise instead."""
+        deadline = time.monotonic() + timeout
+        while True:
+            capture_ns, now_ns = newest(), self._station_ns()
+            age = 0.0 if capture_ns is None or now_ns is None else (now_ns - capture_ns) * 1e-9
+            if capture_ns is not None and (self.max_age is None or age <= self.max_age):
+                return
+            left = deadline - time.monotonic()
+            if left <= 0 or (self._still and capture_ns is not None):
+                got = f"no reading within {timeout:g} s" if capture_ns is None else f"no reading for {age:.3g} s"
+                raise DeviceTimeout(self.name, "read", got, "Check `extrinsic status STATION`")
+            self._arrived.wait(left)
+            check()
+
     def since(self, capture_ns: int) -> list[R]:
-        """Buffered readings captured after ``capture_ns``, oldest first."""
+        """Buffered readings captured after ``capture_ns``, oldest first; what could not be read is not among them."""
         self._need_connection("read")
         with self._arrived:
             out: list[R] = []
@@ -209,7 +286,11 @@ class ForceTorqueSensor(Sensor[WrenchReading]):
 
 
 class TactileSensor(ImagingSensor[ImageReading]):
-    """One tactile finger: Soft Bubble (depth) or GelSlim (colour)."""
+    """One tactile finger: Soft Bubble (depth) or GelSlim (colour). ``describe().extra["sensor"]`` says which."""
+
+    @abstractmethod
+    def reference(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """The picture of the untouched finger, as the mean of many frames; encoded as its readings are."""
 
 
 class TagCamera(ImagingSensor[TagReading]):
@@ -289,8 +370,30 @@ class Simulation(Protocol):
         """Put the world into its initial state: a `drivers.scene.Scene` as a dict. Stamps start again at 0."""
         ...
 
+    def regrasp(self, trial: int) -> None:
+        """Between trials: take the grasped object into the fingers anew, as trial ``trial`` (from 0) has it.
+
+        The same seed and trial give the same grasp, whatever ran before. No time passes.
+        """
+        ...
+
+    def inject(self, fault: Fault | dict) -> None:
+        """Let a fault happen; its times count from now. A reset or `clear_faults` ends it.
+
+        Raises CommandRefused for one that cannot befall this station.
+        """
+        ...
+
+    def clear_faults(self) -> None:
+        """End every fault. What has gone is back, and has to be closed and connected again."""
+        ...
+
     def truth(self) -> TruthReading:
         """The plant's own state at this instant."""
+        ...
+
+    def health(self) -> dict[str, Any]:
+        """How well the simulation itself was since the reset; ``flags`` says in words what was not well."""
         ...
 
     def counts(self) -> dict[str, int]:

@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 from drivers.config import StationConfig
 from drivers.errors import DriverError, NotConnected
-from drivers.interfaces import Arm, Device, ForceTorqueSensor, Gripper, TagCamera
+from drivers.interfaces import Arm, Device, ForceTorqueSensor, Gripper, TactileSensor, TagCamera
 from drivers.wire import topics
 from drivers.wire.bus import Bus, Watch
 from drivers.wire.client import REMOTES, RemoteSensor
@@ -88,12 +88,16 @@ class Devices(Mapping[str, Device]):
         """The force/torque sensor that is mounted at ``wrist`` or ``table``."""
         return cast("ForceTorqueSensor", self._only("force_torque", mount))
 
-    def _only(self, kind: str, mount: str | None = None) -> Device:
-        wanted = kind if mount is None else f"{kind} at the {mount}"
+    def tactile(self, finger: str) -> TactileSensor:
+        """The tactile sensor of the ``left`` or ``right`` finger."""
+        return cast("TactileSensor", self._only("tactile", finger))
+
+    def _only(self, kind: str, place: str | None = None) -> Device:
+        wanted = kind if place is None else f"{kind} at the {place}"
         found = [
             name
             for name, device in self.config.devices.items()
-            if device.kind == kind and (mount is None or getattr(device, "mount", None) == mount)
+            if device.kind == kind and place in (None, getattr(device, "mount", None), getattr(device, "finger", None))
         ]
         if len(found) != 1:
             got = f"the station has {len(found)} of them" if found else "the station has none"

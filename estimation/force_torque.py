@@ -6,7 +6,7 @@ is the negative of what the tool side does to the sensor, moved to the grasp cen
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,11 +21,15 @@ class WristSensor:
     """Where a wrist force/torque sensor sits and what it reads at no load.
 
     ``X_ee_s`` (3,) is its pose in the end-effector; ``offset`` (3,) = (fx, fy, τ) [N, N, N·m] the planar reading at
-    no load, in the sensor's frame.
+    no load, in the sensor's frame. The tool (gripper and fingers) hangs on it with ``tool_mass`` [kg] at ``p_ee_tool``
+    (2,) [m] in the end-effector: a weight that turns in the sensor's frame as the arm turns, which no tare takes out.
     """
 
     X_ee_s: Array
     offset: Array
+    tool_mass: float = 0.0
+    p_ee_tool: Array = field(default_factory=lambda: np.zeros(2))
+    gravity: float = 9.81
 
     def wrench_on_go(self, reading: Array, X_W_ee: Array, p_W_grasp: Array) -> Array:
         """Wrench (fx, fy, τ) of the sensor on the go about the grasp centre, axes of W.
@@ -35,12 +39,22 @@ class WristSensor:
         """
         X_W_s = se2.compose(X_W_ee, self.X_ee_s)
         on_sensor = wrench.rotated(TaskPlane().wrench_to_planar(reading) - self.offset, X_W_s[2])
+        if self.tool_mass:
+            on_sensor = on_sensor - self._tool_weight(X_W_ee)
         return wrench.about(-on_sensor, X_W_s[:2], p_W_grasp)
+
+    def _tool_weight(self, X_W_ee: Array) -> Array:
+        """The tool's weight on the sensor about its origin, axes of W."""
+        lever = se2.transform(X_W_ee, self.p_ee_tool) - se2.compose(X_W_ee, self.X_ee_s)[:2]
+        return gravity_wrench(self.tool_mass, lever, self.gravity)
 
     def reading_of(self, wrench_on_go_W: Array, X_W_ee: Array, p_W_grasp: Array) -> Array:
         """Planar reading (3,) in the sensor's frame, less its offset, that `wrench_on_go` turns into the wrench."""
         X_W_s = se2.compose(X_W_ee, self.X_ee_s)
-        return wrench.rotated(wrench.about(-wrench_on_go_W, p_W_grasp, X_W_s[:2]), -X_W_s[2])
+        on_sensor = wrench.about(-wrench_on_go_W, p_W_grasp, X_W_s[:2])
+        if self.tool_mass:
+            on_sensor = on_sensor + self._tool_weight(X_W_ee)
+        return wrench.rotated(on_sensor, -X_W_s[2])
 
     def zeroed(self, reading: Array, X_W_ee: Array, X_W_go: Array, grasp: Array, weight: FreeAirLoad) -> WristSensor:
         """The same sensor with its offset taken in free air, where it carries the go's known weight and nothing else.

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from drivers.config import ForceTorqueConfig
+from math import inf
+
+from drivers.config import ForceTorqueConfig, WorldConfig
+from drivers.sim.mismatch import load_profile
+from drivers.sim.preflight import coupling_of, refuse_impossible
 from experiments.files import Resolved
 from experiments.schema import PlanStage
-from experiments.setup import task
+from experiments.setup import scene, task
 from mechanics.yaml_input import InputError, Problem
 from planning.task import Task
 
 
 def check(resolved: Resolved) -> list[str]:
     """What would run, in lines for a person. Raises InputError, and InfeasiblePlan where a task says so itself."""
-    problems = _device_problems(resolved)
+    problems = _device_problems(resolved) + _scene_problems(resolved)
     if problems:
         raise InputError(problems)
     made = tasks(resolved)
@@ -84,3 +88,32 @@ def _device_problems(resolved: Resolved) -> list[Problem]:
         wrong = f"{resolved.grasped.name} has no tag: the camera could not see it"
         problems.append(resolved.experiment_document.problem(("grasped_object",), wrong, "an object with a `tag`"))
     return problems
+
+
+#: where a person sets what the scene has under each key, and what is expected there
+_SCENE_KEYS = {
+    "scene.stiffness": (("sensor",), "a sensor stiff enough for this object, or a grasp nearer to its vertices"),
+    "scene.friction": (("friction",), "a coefficient above 0 for each pair that can touch"),
+    "scene.extrinsic_pose": (("extrinsic_object",), "a pose in the world, clear of the ground"),
+    "scene.start": (("grasped_object",), "bodies that are clear of each other at the start"),
+}
+
+
+def _scene_problems(resolved: Resolved) -> list[Problem]:
+    """What the simulated world would refuse when the run has already begun. Raises InputError for the profile."""
+    world = resolved.station.world or WorldConfig()
+    profile = load_profile(world.profile)
+    limit = (profile.fingers.force_limit or inf, profile.fingers.torque_limit or inf)
+    try:
+        begin = scene(resolved)
+        refuse_impossible(begin, coupling_of(begin, world.stiffness_scale, profile.membrane, limit))
+    except ValueError as e:
+        key, _, text = str(e).partition(": ")
+        if key == "scene.finger_limit":
+            expected = "a profile whose fingers hold this object"
+            return [resolved.station_document.problem(("world", "profile"), text, expected)]
+        if key not in _SCENE_KEYS:
+            raise
+        path, expected = _SCENE_KEYS[key]
+        return [resolved.experiment_document.problem(path, text, expected)]
+    return []

@@ -18,7 +18,7 @@ from ruamel.yaml.comments import CommentedSeq
 
 import experiments
 from drivers.config import StationConfig
-from drivers.sim.mismatch import profile_names
+from drivers.sim.mismatch import load_profile, profile_names
 from experiments.schema import Experiment
 from mechanics import model_paths
 from mechanics.catalogue import CATALOGUE, SENSORS, ObjectModel, SensorModel
@@ -268,7 +268,11 @@ def _world_problems(station: StationConfig, document: Document) -> list[Problem]
         wrong = f"missing key: {', '.join(simulated)} are simulated"
         return [document.problem(("world",), wrong, "the simulated world")] if simulated else []
     profile, known = station.world.profile, profile_names()
-    if profile in known:
+    if profile in known or Path(profile).name != profile or profile.endswith((".yaml", ".yml")):
+        try:
+            load_profile(profile)
+        except InputError as error:
+            return list(error.problems)
         return []
     wrong = f"unknown world profile {profile!r}"
     return [document.problem(("world", "profile"), wrong, one_of(known), nearest(profile, known))]

@@ -59,6 +59,7 @@ def run(resolved: Resolved, out: Path | None = None, console: Console | None = N
         "plans": [],
         "trials": [],
         "tables": [],
+        "timing": {"execute_wall_s": 0.0, "execute_station_s": 0.0},
     }
     with Interrupt() as interrupt:
         try:
@@ -106,8 +107,23 @@ def _stages(
         interrupt.closing()
         if code in (ExitCode.INFEASIBLE, ExitCode.INTERRUPTED, ExitCode.DEVICE_FAILED):
             context.event("error", reason)
+        results["health"] = _health(context)
         results["log"] = _accounts(context, log)
     return code, reason
+
+
+def _health(context: RunContext) -> dict[str, Any] | None:
+    """How well the simulated plant was; what was not well is an event, too. None where nothing was simulated."""
+    devices = context.opened
+    if devices is None or devices.simulation is None:
+        return None
+    try:
+        health = devices.simulation.health()
+    except DriverError:  # it has died, and the run's own error says so
+        return None
+    for flag in health["flags"]:
+        context.event("warning", f"the simulated plant: {flag}")
+    return health
 
 
 def _accounts(context: RunContext, log: LogWriter) -> dict[str, Any]:

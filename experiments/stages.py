@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from control.base import Controller
 from control.observe import Observer
 from control.trial import Trial, TrialResult, Watch
-from drivers.errors import DriverError
+from drivers.errors import DriverError, SimulationDiverged
 from drivers.station import Devices
 from estimation.force_torque import WristSensor
 from experiments import registries, setup
@@ -54,12 +55,24 @@ def execute_stage(context: RunContext, stage: ExecuteStage) -> None:
     """
     plan = context.plans[stage.plan]
     devices = context.devices()
-    with devices.arm.lease(context.holder):
+    with devices.arm.lease(context.holder), _timed(context, devices):
         for trial in range(stage.trials):
             for name in stage.controllers:
                 result = _one_trial(context, devices, plan, registries.controllers()[name], trial)
                 if result.status in ("device_failed", "stopped", "diverged"):
                     return
+
+
+@contextmanager
+def _timed(context: RunContext, devices: Devices) -> Iterator[None]:
+    """Add wall time and station time of the block to the results, whatever ends it."""
+    wall, station_ns = time.perf_counter(), devices.clock.now_ns()
+    try:
+        yield
+    finally:
+        timing = context.results["timing"]
+        timing["execute_wall_s"] += time.perf_counter() - wall
+        timing["execute_station_s"] += (devices.clock.now_ns() - station_ns) * 1e-9
 
 
 def _one_trial(
@@ -86,8 +99,12 @@ def _one_trial(
         )
         clock, load = devices.clock, setup.free_air_load(context.resolved)
         try:
+            if devices.simulation is not None:
+                devices.simulation.regrasp(trial)
             observer = _observer(context, devices)
             result = Trial(name, plan, controller, observer, clock, load, context.settings, watch).run()
+        except SimulationDiverged as error:
+            result = TrialResult("diverged", str(error), plan)
         except DriverError as error:  # before the protocol began
             result = TrialResult("device_failed", str(error), plan)
     context.results["trials"].append(_row(context, name, controller.name, trial, result, waypoints))
@@ -99,6 +116,8 @@ def _one_trial(
 
 def _observer(context: RunContext, devices: Devices) -> Observer:
     wrist = devices.force_torque("wrist")
+    said = wrist.describe().extra
+    tool = said.get("tool", {"mass": 0.0, "centre": (0.0, 0.0)})
     settings = context.settings
     return Observer(
         arm=devices.arm,
@@ -106,7 +125,9 @@ def _observer(context: RunContext, devices: Devices) -> Observer:
         camera=devices.camera,
         camera_model=CameraModel.from_dict(devices.camera.describe().extra["camera"]),
         tags=setup.tags(context.resolved),
-        wrist_sensor=WristSensor(np.array(wrist.describe().extra["pose"], float), np.zeros(3)),
+        wrist_sensor=WristSensor(
+            np.array(said["pose"], float), np.zeros(3), tool["mass"], np.array(tool["centre"], float), setup.GRAVITY
+        ),
         grasp=context.resolved.grasp,
         window_ns=round(settings.window * 1e9),
         frames=settings.tag_frames,

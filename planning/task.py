@@ -22,7 +22,7 @@ class ContactRequest:
     """
 
     name: str
-    p_goC: Array  # noqa: N815
+    p_goC: Array
     normal: Array
     modes: tuple[Mode, ...]
     mu: float

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections import deque
 from fractions import Fraction
 from typing import Protocol, TypeVar
 
 import numpy as np
 
 from drivers.errors import DeviceTimeout
-from drivers.interfaces import Sensor, _Stamped
-from drivers.sim.mismatch import Mismatch
+from drivers.interfaces import _Stamped, freshness
+from drivers.sim.faults import Faulty, Guard, guarded, received
+from drivers.sim.mismatch import Lab, Mismatch, Stream
 from drivers.sim.plant import Plant
 from mechanics.readings import Stamp, Status
 
@@ -22,6 +24,8 @@ class DeviceWorld(Protocol):
 
     lockstep: bool
     profile: Mismatch
+    #: what the profile comes to for the seed of the last reset
+    lab: Lab
 
     @property
     def timestep_ns(self) -> int:
@@ -58,10 +62,11 @@ class Ticker:
         return False
 
 
-class Simulated(Sensor[R]):
+class Simulated(Faulty[R]):
     """A simulated sensor that samples the plant at its rate while it is open.
 
-    In lockstep nothing arrives while somebody waits, so `latest` never waits.
+    In lockstep nothing arrives while somebody waits, so `latest` never waits. A reading that the profile or a fault
+    drops leaves a gap in the sequence numbers; one that they delay keeps its capture time and arrives when it is due.
     """
 
     def __init__(self, name: str, rate: float, world: DeviceWorld):
@@ -78,13 +83,33 @@ class Simulated(Sensor[R]):
         self._ticker = Ticker(rate, world.timestep_ns)
         self._sequence = 0
         self._rng = np.random.default_rng(0)
+        self._losses = self._rng
+        self._under_way: deque[tuple[int, R]] = deque()
+        self._link = Stream()
+        self._guard = Guard()
+        self._still = world.lockstep
+
+    def _make_guard(self) -> Guard:
+        """What looks over the device's readings before they are handed on."""
+        return Guard()
+
+    def _station_ns(self) -> int:
+        return self._world.now_ns()
+
+    def _figures(self) -> Stream:
+        """What the profile does to this device's readings on their way."""
+        return Stream()
 
     def restart(self, rng: np.random.Generator) -> None:
         """Begin a new epoch after the world was reset: sequence numbers start at 0 and old readings are gone."""
         self._forget()
         self._ticker.restart()
         self._sequence = 0
-        self._rng = rng
+        # losses have numbers of their own, so that they change nothing of what is not lost
+        self._rng, self._losses = rng, rng.spawn(1)[0]
+        self._under_way.clear()
+        self._link = self._figures()
+        self._guard = self._make_guard()
 
     @property
     def count(self) -> int:
@@ -93,8 +118,29 @@ class Simulated(Sensor[R]):
 
     def sample(self) -> None:
         """Called by the world after every step."""
+        if self._under_way:
+            self._deliver()
         if self._ticker.due() and self._connected:
-            self._push(self._read())
+            line, link = self.line, self._link
+            if line.silent:
+                return
+            reading = guarded(self._guard, line.altered(self._read()))
+            if (link.dropout and self._losses.random() < link.dropout) or line.loses():
+                return
+            latency = link.latency + line.delay
+            if latency or self._under_way:
+                due = self._world.now_ns() + round(latency * 1e9)
+                # readings never overtake one another
+                self._under_way.append((max(due, self._under_way[-1][0]) if self._under_way else due, reading))
+            else:
+                self._deliver_or_damage(reading)
+
+    def _deliver(self) -> None:
+        now = self._world.now_ns()
+        while self._under_way and self._under_way[0][0] <= now:
+            reading = self._under_way.popleft()[1]
+            if self._connected and not self.line.silent:
+                self._deliver_or_damage(received(reading, now))
 
     def _stamp(self, status: Status = Status.OK) -> Stamp:
         now = self._world.now_ns()
@@ -107,10 +153,10 @@ class Simulated(Sensor[R]):
         """One reading of the present state, stamped."""
 
     def latest(self, timeout: float = 1.0) -> R:
-        """The newest reading. Raises DeviceTimeout when none was taken since the reset."""
+        """As `Sensor.latest`. Raises DeviceTimeout at once when none was taken since the reset."""
         self._need_connection("read")
         self._world.plant(self.name, "read")
-        if self._world.lockstep and not self._readings:
+        if self._world.lockstep and not self._readings and self._damaged is None:
             raise DeviceTimeout(
                 self.name, "read", "no reading since the reset", "Let station time pass first: `clock.sleep(seconds)`"
             )
@@ -118,6 +164,8 @@ class Simulated(Sensor[R]):
 
     def _open(self, timeout: float) -> None:
         self._forget()
+        self._under_way.clear()
+        self.max_age = freshness(self.rate)
 
     def _shut(self) -> None:
-        pass
+        self._under_way.clear()

@@ -6,6 +6,15 @@ from dataclasses import dataclass
 
 from mechanics.readings import Array
 
+X_EE_FINGER = {
+    "left": ((1.0, 0, 0, 0), (0, 0, -1.0, 0), (0, 1.0, 0, 0), (0, 0, 0, 1.0)),
+    "right": ((-1.0, 0, 0, 0), (0, 0, 1.0, 0), (0, 1.0, 0, 0), (0, 0, 0, 1.0)),
+}
+"""Poses (4, 4) of the fingers' frames in ee, whose 3-D axes are X right, Y away from the viewer, Z up.
+
+x and y of a finger's frame are right and up as one sees the object from it, z points from the object into the finger.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class FingerView:

@@ -8,11 +8,16 @@ from drivers.config import GripperConfig
 from drivers.errors import CommandRefused
 from drivers.interfaces import Description, Gripper
 from drivers.sim.device import DeviceWorld, Simulated
+from drivers.sim.faults import Guard, MotionGuard
+from drivers.sim.mismatch import Stream
 from drivers.sim.model import HALF_DEPTH
 from mechanics.readings import GripperReading
 
 #: widest opening [m], largest and usual grasp force [N]
 OPEN, STRONGEST, USUAL = 0.08, 70.0, 20.0
+
+#: faster than this [m/s, N/s] no reading changes by itself; a command that asks for more than `SEEN` [m, N] shows
+FASTEST, SEEN = (0.1, 100.0), (1e-4, 0.1)
 
 
 class SimGripper(Simulated[GripperReading], Gripper):
@@ -56,6 +61,12 @@ class SimGripper(Simulated[GripperReading], Gripper):
         self._need_connection("release")
         self._world.plant(self.name, "release").release()
         self._width, self._force = OPEN, 0.0
+
+    def _figures(self) -> Stream:
+        return self._world.profile.gripper
+
+    def _make_guard(self) -> Guard:
+        return MotionGuard(FASTEST, SEEN, lambda: (self._width, self._force))
 
     def _read(self) -> GripperReading:
         return GripperReading(self._stamp(), self._width, self._force, self._world.plant(self.name, "read").held)

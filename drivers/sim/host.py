@@ -22,7 +22,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 
 from pydantic import ValidationError
 
@@ -30,6 +29,7 @@ from drivers.config import StationConfig, WorldConfig
 from drivers.errors import CommandRefused, DriverError, NotConnected
 from drivers.interfaces import Arm, ImagingSensor
 from drivers.scene import Scene
+from drivers.sim.faults import Faulty
 from drivers.sim.world import World
 from drivers.wire import messages, topics
 from drivers.wire.arm_server import ArmServer
@@ -42,16 +42,9 @@ TRUTH_PERIOD_NS = 20_000_000
 """Truth is published at 50 Hz of station time; in lockstep urgent work also waits no longer than this."""
 _PIECE = 0.002  # how much real time is simulated at once [s]
 _IDLE = 0.5
-_LAG = 0.25  # a world that is this late gives up the lost time [s]
+_LAG = 0.05  # a world that is this late gives up the lost time, well before its readings count as old [s]
 
 log = logging.getLogger(__name__)
-
-
-@dataclass
-class _Camera:
-    server: DeviceServer
-    period: float
-    due: float = 0.0
 
 
 class Inbox:
@@ -111,8 +104,9 @@ class Host:
         self._anchor = 0.0  # monotonic instant at which the world should have been at step 0
         self._origin_ns = 0
         self._truths = self._next_truth_ns = 0
-        self._arms: list[ArmServer] = []
-        self._cameras: list[_Camera] = []
+        self._servers: dict[str, DeviceServer] = {}
+        self._due: dict[str, float] = {}  # when a camera takes its next frame in real time [s]
+        self.world.faults.on_crash = _die
 
     def _now_ns(self) -> int:
         return self.world.now_ns() + self.skipped_ns
@@ -125,19 +119,18 @@ class Host:
     def run(self, ready: Callable[[], None] = lambda: None) -> None:
         """Serve until `stop`; ``ready`` is called once every device is on the bus."""
         with ExitStack() as stack:
-            for name, device in self.world.devices.items():
-                server = ArmServer(self.desk, device) if isinstance(device, Arm) else DeviceServer(self.desk, device)
-                stack.enter_context(server)
-                if isinstance(server, ArmServer):
-                    self._arms.append(server)
-                elif isinstance(device, ImagingSensor):
-                    self._cameras.append(_Camera(server, 1.0 / self.config.devices[name].rate))
+            stack.callback(self._withdraw)
+            self._attend()
             self._truth_stream = self.desk.publisher(topics.WORLD, "truth", messages.TRUTH)
             stack.callback(self._truth_stream.close)
             for verb, work in (
                 ("reset", self._reset),
                 ("advance", self._advance),
+                ("regrasp", self._regrasp),
                 ("truth", self._truth),
+                ("inject", self._inject),
+                ("clear_faults", self._clear_faults),
+                ("health", lambda _: Answer(json.dumps(self.world.health()))),
                 ("counts", lambda _: Answer(json.dumps(self.desk.counts()))),
             ):
                 stack.callback(self.desk.serve(topics.WORLD, verb, work))
@@ -147,6 +140,22 @@ class Host:
             while not self._stopping:
                 wait = _IDLE if self.world.lockstep or not self._staged else self._pace()
                 self.inbox.serve(wait)
+
+    def _attend(self) -> None:
+        """Serve the devices that are there, and no others: a device that has gone takes its server with it."""
+        for name, device in self.world.devices.items():
+            gone, server = isinstance(device, Faulty) and device.line.gone, self._servers.get(name)
+            if server is None and not gone:
+                server = ArmServer(self.desk, device) if isinstance(device, Arm) else DeviceServer(self.desk, device)
+                self._servers[name] = server
+                server.open()
+            elif server is not None and gone:
+                del self._servers[name]
+                server.close()
+
+    def _withdraw(self) -> None:
+        while self._servers:
+            self._servers.popitem()[1].close()
 
     def _pace(self) -> float:
         """Bring the world up to the present; returns how long to wait for the next piece [s]."""
@@ -160,10 +169,10 @@ class Host:
         if behind < _PIECE:
             return _PIECE - behind
         self._step(int(_PIECE * 1e9))
-        for camera in self._cameras:
-            if simulated >= camera.due:
-                camera.due = simulated + camera.period
-                camera.server.capture_if_wanted()
+        for name, server in self._servers.items():
+            if isinstance(server.device, ImagingSensor) and simulated >= self._due.get(name, 0.0):
+                self._due[name] = simulated + 1.0 / self.config.devices[name].rate
+                server.capture_if_wanted()
         return 0.0
 
     def _step(self, span_ns: int) -> None:
@@ -172,6 +181,7 @@ class Host:
             piece = min(span_ns, max(self._next_truth_ns - (self.world.now_ns() - self._origin_ns), 1))
             self.world.advance(piece * 1e-9)
             span_ns -= piece
+            self._attend()
             self._publish_truth()
             self.inbox.serve_urgent()
 
@@ -200,8 +210,8 @@ class Host:
 
     def _reset(self, payload: bytes) -> None:
         asked = messages.decode(payload, messages.RESET)
-        for server in self._arms:
-            other = server.foreign_commander(asked.session)
+        for server in self._servers.values():
+            other = server.foreign_commander(asked.session) if isinstance(server, ArmServer) else None
             if other is not None:
                 raise CommandRefused(
                     topics.WORLD, "reset", f"{other} commands {server.device.name}", "Wait until its run has ended"
@@ -217,8 +227,8 @@ class Host:
         self._origin_ns, self._anchor = self.world.now_ns(), time.monotonic()
         self._truths = self._next_truth_ns = 0
         self._staged = True
-        for camera in self._cameras:
-            camera.due = 0.0
+        self._due.clear()
+        self._attend()
         self._publish_truth()
 
     def _advance(self, payload: bytes) -> None:
@@ -230,8 +240,28 @@ class Host:
         self.world.plant("world", "advance")
         self._step(span_ns)
 
+    def _regrasp(self, payload: bytes) -> None:
+        self.world.regrasp(messages.decode(payload, messages.INTEGER).data)
+
+    def _inject(self, payload: bytes) -> None:
+        try:
+            fault = json.loads(messages.decode(payload, messages.STRING).data)
+        except ValueError as error:
+            raise CommandRefused(topics.WORLD, "inject a fault", str(error), "Send JSON") from error
+        self.world.inject(fault)
+        self._attend()
+
+    def _clear_faults(self, _: bytes) -> None:
+        self.world.clear_faults()
+        self._attend()
+
     def _truth(self, _: bytes) -> Answer:
         return Answer(type=messages.TRUTH, data=encode_reading(self.world.truth(), self.skipped_ns))
+
+
+def _die() -> None:
+    """End this process as a crash does: no farewell to anybody."""
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def serve(config: StationConfig, ready: Callable[[Host], None] = lambda _: None) -> int:

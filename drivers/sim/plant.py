@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from math import ceil, cos, sin
+from math import ceil, cos, hypot, inf, sin
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from drivers.errors import DeviceFault
+from drivers.errors import CommandRefused, SimulationDiverged
 from drivers.scene import Scene
 from drivers.sim.coupling import Coupling, Grip
+from drivers.sim.health import LOOK, Health, Touch
+from drivers.sim.membrane import Membrane
 from drivers.sim.model import build, mujoco, polar_inertia
+from drivers.sim.preflight import refuse_impossible
 from mechanics.polygon import Polygon
 from mechanics.readings import Array, ContactTruth
 
@@ -35,30 +39,40 @@ class Plant:
     before the present poses.
     """
 
-    def __init__(self, scene: Scene, stiffness_scale: float = 1.0, timestep: float = 0.001):
+    def __init__(
+        self,
+        scene: Scene,
+        stiffness_scale: float = 1.0,
+        timestep: float = 0.001,
+        membrane: Membrane | None = None,
+        finger_limit: tuple[float, float] = (inf, inf),
+    ):
         """Compile the scene; `reset` comes next and is called here once.
 
+        ``finger_limit`` is the force [N] and the torque [N·m] beyond which the go slips between the fingers.
         Raises ValueError for a scene that cannot be: no friction for a pair, a stiffness that is not positive
-        definite, bodies that overlap each other or the ground.
+        definite or lets the go spin out, bodies that overlap each other or the ground.
         """
-        if scene.extrinsic is not None and scene.extrinsic_pose is None:
-            raise ValueError("scene.extrinsic_pose: missing; an extrinsic body needs its pose in W")
         self.scene, self.timestep = scene, timestep
+        self.membrane, self.finger_limit = membrane or Membrane(), finger_limit
         self._inertia = polar_inertia(scene.grasped)
         self._stiffness = np.array(scene.stiffness) * stiffness_scale
-        self._initial_coupling = self._coupling_at(scene.grasp)
-        self._substeps = max(1, ceil(self._initial_coupling.fastest * timestep / RESOLVED))
-        self.model = build(scene, timestep / self._substeps)
+        coupling = self._coupling_at(scene.grasp)
+        refuse_impossible(scene, coupling)
+        self._substeps = max(1, ceil(coupling.fastest * timestep / RESOLVED))
+        self._substep = timestep / self._substeps
+        self._steps_per_look = max(1, round(LOOK / timestep))
+        self.model = build(scene, self._substep)
         self.data = mujoco.MjData(self.model)
         self._has_eo = scene.extrinsic is not None
         self._owner = [self._body_of(i) for i in range(self.model.ngeom)]
         d = self.data
         self._qpos, self._qvel, self._applied, self._reaction = d.qpos, d.qvel, d.qfrc_applied, d.qfrc_constraint
-        self._force = np.zeros(6)
         self.reset()
 
     def _coupling_at(self, grasp: ArrayLike) -> Coupling:
-        return Coupling(self._stiffness, grasp, self.scene.grasped.mass, self._inertia)
+        mass, inertia = self.scene.grasped.mass, self._inertia
+        return Coupling(self._stiffness, grasp, mass, inertia, self.membrane, self.finger_limit)
 
     def _body_of(self, geom: int) -> str:
         return self.model.geom(geom).name.rstrip("0123456789")
@@ -68,10 +82,11 @@ class Plant:
     def reset(self) -> None:
         """Back to the start: ee at rest at ``scene.start``, the go hanging from it at rest in free air."""
         mujoco.mj_resetData(self.model, self.data)
-        self.coupling = self._initial_coupling
+        self.coupling = self._coupling_at(self.scene.grasp)
+        self._slipped = self._turned = 0.0
         self.held = True
         self.steps = 0
-        self._fault: DeviceFault | None = None
+        self._fault: SimulationDiverged | None = None
         #: how often the number of contact points has changed: a contact that flickers at rest is a sick one
         self.contact_changes = 0
         self._ee: Pose = self.scene.start
@@ -85,11 +100,12 @@ class Plant:
         self._state_of_forces = self._state
         self._contact_points = self.data.ncon
         self._refuse_overlap()
+        self._health = Health(self)
 
     def step(self, X_W_ee: Pose, V_W_ee: Pose) -> None:
         """Advance by one step, at whose end the ee is at ``X_W_ee`` with the twist ``V_W_ee``; all floats in W.
 
-        Raises DeviceFault when the state has diverged, and again until `reset`.
+        Raises SimulationDiverged when the state has diverged, and again until `reset`.
         """
         if self._fault is not None:
             raise self._fault
@@ -103,26 +119,28 @@ class Plant:
                 self._step((x, y, theta), V_W_ee)
             self._step(X_W_ee, V_W_ee)
         self.steps += 1
+        if self.steps % self._steps_per_look == 0:
+            self._health.look()
 
     def _step(self, ee: Pose, ee_twist: Pose) -> None:
         self._apply()
         self._state_of_forces = self._state
         mujoco.mj_step(self.model, self.data)
         self._ee, self._ee_twist = ee, ee_twist
-        self._observe()
+        self._observe(self._substep)
         if self.data.ncon != self._contact_points:
             self._contact_points = self.data.ncon
             self.contact_changes += 1
 
-    def _observe(self) -> None:
-        """Take the new state over and find the grip that acts in it."""
+    def _observe(self, dt: float = 0.0) -> None:
+        """Take the new state over, which is ``dt`` [s] after the last, and find the grip that acts in it."""
         q, v = self._qpos.tolist(), self._qvel.tolist()
         # sums, which a NaN poisons, and compared so that a NaN fails
         if not (sum(map(abs, q)) < FARTHEST and sum(map(abs, v)) < FASTEST):
             self._diverged(f"the bodies are at {np.round(q, 3).tolist()}")
         self._state = q
         if self.held:
-            self._grip = self.coupling.grip(tuple(q[:3]), tuple(v[:3]), self._ee, self._ee_twist)
+            self._grip = self.coupling.grip(tuple(q[:3]), tuple(v[:3]), self._ee, self._ee_twist, dt)
         else:
             self._grip = Grip(0.0, 0.0, 0.0, *self.coupling.grasp_pose(q[:3])[:2])
 
@@ -135,7 +153,7 @@ class Plant:
         applied[0], applied[1], applied[2] = fx, fy, tau
 
     def _diverged(self, what: str) -> None:
-        self._fault = DeviceFault(
+        self._fault = SimulationDiverged(
             "world",
             f"step {self.steps} at {self.steps * self.timestep:.3f} s",
             f"the simulated state has diverged: {what}",
@@ -173,10 +191,44 @@ class Plant:
             grasp = np.array([c * dx + s * dy, c * dy - s * dx, self._ee[2] - angle])
             inside = Polygon(np.asarray(self.scene.grasped.vertices)).signed_distance(grasp[:2]) < 0
             if inside:
+                self._retire(self.coupling)
                 self.coupling = self._coupling_at(grasp)
                 self.held = True
                 self._observe()
         return self.held
+
+    def regrasp(self, grasp: ArrayLike, strain: ArrayLike = (0.0, 0.0, 0.0)) -> None:
+        """Put the go between the fingers anew with gocf at ``grasp`` (3,) on it: it hangs at rest, its fingers too.
+
+        ``strain`` is what the handling leaves in the membrane, see `MembraneSpring.strain`. No time passes. Raises
+        CommandRefused, and changes nothing, where the go would then touch something.
+        """
+        before, q, v = self.coupling, self._qpos.copy(), self._qvel.copy()
+        self.coupling = self._coupling_at(grasp)
+        self.coupling.strain(np.asarray(strain, float))
+        self._qpos[:3] = self.coupling.sagged(self._ee, self.scene.gravity)
+        self._qvel[:3] = 0.0
+        mujoco.mj_forward(self.model, self.data)
+        touched = [pair for pair in self._touching() if "go" in pair]
+        if touched:
+            self.coupling, self._qpos[:], self._qvel[:] = before, q, v
+            mujoco.mj_forward(self.model, self.data)
+            raise CommandRefused(
+                "world", "regrasp", f"{touched[0][0]} and {touched[0][1]} would overlap", "Lift the arm first"
+            )
+        self._retire(before)
+        self.held, self._ee_twist = True, ZERO
+        self._observe()
+        self._state_of_forces = self._state
+
+    def _retire(self, coupling: Coupling) -> None:
+        self._slipped += coupling.slipped
+        self._turned += coupling.turned
+
+    def _touching(self) -> list[list[str]]:
+        """The pairs of bodies that touch or overlap, sorted by name."""
+        contacts = (self.data.contact[i] for i in range(self.data.ncon))
+        return [sorted(self._owner[g] for g in contact.geom) for contact in contacts]
 
     # -- what the plant knows ------------------------------------------------------------------------------------
 
@@ -238,16 +290,18 @@ class Plant:
         other way; ``stick`` below `SLIP_SPEED`.
         """
         merged: list[list] = []
-        for i in range(self.data.ncon):
-            contact = self.data.contact[i]
-            if contact.efc_address < 0:
+        contacts = self.data.contact
+        addresses = contacts.efc_address.tolist() if self.data.ncon else []
+        frames, points, geoms = contacts.frame, contacts.pos, contacts.geom.tolist()
+        forces = self.data.efc_force
+        for i, address in enumerate(addresses):
+            if address < 0:
                 continue
-            on, by = self._owner[contact.geom[1]], self._owner[contact.geom[0]]
-            mujoco.mj_contactForce(self.model, self.data, i, self._force)
+            by, on = self._owner[geoms[i][0]], self._owner[geoms[i][1]]
             # the normal points from the first geom into the second, on which the force acts
-            axes = contact.frame.reshape(3, 3)
-            force, normal = (self._force[:3] @ axes)[[0, 2]], axes[0, [0, 2]]
-            point = contact.pos[[0, 2]]
+            axes = frames[i].reshape(3, 3)
+            force, normal = (forces[address : address + 3] @ axes)[[0, 2]], axes[0, [0, 2]]
+            point = points[i, [0, 2]]
             for other in merged:
                 if other[:2] == [on, by] and np.abs(other[2] - point).max() < SAME_POINT and other[3] @ normal > 0.99:
                     other[4] = other[4] + force
@@ -259,6 +313,61 @@ class Plant:
             for on, by, point, normal, force in merged
         ]
         return tuple(sorted(out, key=lambda c: (c.on, c.by, float(c.point[0]), float(c.point[1]))))
+
+    # -- how well the plant is -------------------------------------------------------------------------------------
+
+    def health(self) -> dict[str, Any]:
+        """`Health.summary` since the reset."""
+        return self._health.summary()
+
+    @property
+    def finger_slip(self) -> float:
+        """How far the go has slipped between the fingers since the reset: length of the path [m]."""
+        return self._slipped + self.coupling.slipped
+
+    @property
+    def finger_turn(self) -> float:
+        """How far it has turned between them, forth and back [rad]."""
+        return self._turned + self.coupling.turned
+
+    def deepest(self) -> float:
+        """Penetration [m] of the deepest contact, 0 where there is none."""
+        return max(0.0, -float(self.data.contact.dist.min())) if self.data.ncon else 0.0
+
+    def touches(self) -> list[Touch]:
+        """The contact points that carry load, as `Health` looks at them."""
+        if not self.data.ncon:
+            return []
+        contacts, forces = self.data.contact, self.data.efc_force
+        out = []
+        for address, (by, on), (x, _, y), frame, friction in zip(
+            contacts.efc_address.tolist(),
+            contacts.geom.tolist(),
+            contacts.pos.tolist(),
+            contacts.frame.tolist(),
+            contacts.friction.tolist(),
+            strict=True,
+        ):
+            if address < 0:
+                continue
+            normal, first, second = forces[address : address + 3].tolist()
+            if normal > 0:
+                share = hypot(first, second) / (friction[0] * normal)
+                out.append(Touch(self._owner[on], self._owner[by], x, y, frame[2], -frame[0], share))
+        return out
+
+    def place(self, body: str) -> Pose:
+        """Pose in W of ``go``, ``eo`` or ``ground``."""
+        if body == "ground":
+            return ZERO
+        first = 0 if body == "go" else 3
+        x, y, angle = self._state[first : first + 3]
+        return x, y, angle
+
+    def twist(self, body: str) -> Array:
+        """Velocity (3,) in W, (ẋ, ẏ, θ̇), of ``go``, ``eo`` or ``ground``."""
+        first = {"go": 0, "eo": 3}.get(body)
+        return np.zeros(3) if first is None else np.array(self._qvel[first : first + 3])
 
     def _mode(self, on: str, by: str, point: Array, normal: Array) -> str:
         t = np.array([normal[1], -normal[0]])

@@ -9,18 +9,31 @@ from collections.abc import Iterable
 from functools import lru_cache
 from typing import Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.config import TagCameraConfig
 from drivers.interfaces import Description, TagCamera
 from drivers.scene import TagMount
+from drivers.sim.camera_errors import actual, calibrated, exposed
+from drivers.sim.faults import Faulty, received
+from drivers.sim.mismatch import CameraFigures
+from drivers.sim.screen import Screen
 from drivers.tags import TagDetector, tag_bitmap
 from mechanics.camera import CameraModel, point_in_world
 from mechanics.readings import Array, ImageReading, Stamp, TagReading
 from mechanics.se2 import transform
 
 _BLACK, _WHITE, _BACKGROUND = 20.0, 235.0, 128.0  # grey levels of matt print under even light
+_FINGER = 70.0
+_SMEAR = 0.1  # px of motion while a frame is exposed, below which it is not drawn
+_POSES = 5  # of what moves, in one frame
+
+
+class _Profile(Protocol):
+    @property
+    def camera(self) -> CameraFigures: ...
 
 
 class TagWorld(Protocol):
@@ -28,12 +41,25 @@ class TagWorld(Protocol):
 
     lockstep: bool
 
+    @property
+    def profile(self) -> _Profile:
+        """The mismatch profile."""
+        ...
+
     def now_ns(self) -> int:
         """Present instant [ns]."""
         ...
 
     def visible_tags(self) -> list[tuple[TagMount, Array]]:
         """Each tag with the pose X_W_body (3,) of the body that carries it."""
+        ...
+
+    def tag_twists(self) -> dict[int, Array]:
+        """Velocity (3,) in W, (ẋ, ẏ, θ̇), of the bodies that carry tags, by the tag's id; none for what stands."""
+        ...
+
+    def screens(self) -> list[Screen]:
+        """What stands in front of the tags."""
         ...
 
 
@@ -49,12 +75,33 @@ class TagRenderer:
         self.camera = camera
         self._pieces = 4 if camera.distortion.any() else 1
 
-    def render(self, tags: Iterable[tuple[TagMount, Array]]) -> NDArray[np.uint8]:
-        """Picture (h, w) of tags on bodies at X_W_body (3,); a tag further in front hides what is behind it."""
+    def render(self, tags: Iterable[tuple[TagMount, Array]], screens: Iterable[Screen] = ()) -> NDArray[np.uint8]:
+        """Picture (h, w) of tags on bodies at X_W_body (3,); a tag further in front hides what is behind it.
+
+        Screens hide all tags that they stand in front of.
+        """
+        return np.rint(self.paint(tags, screens)).astype(np.uint8)
+
+    def paint(self, tags: Iterable[tuple[TagMount, Array]], screens: Iterable[Screen] = ()) -> Array:
+        """The same in grey levels, before they are rounded."""
         grey = np.full((self.camera.height, self.camera.width), _BACKGROUND)
-        for mount, X_W_body in sorted(tags, key=lambda tag: tag[0].height):
-            self._draw(grey, mount, X_W_body)
-        return np.rint(grey).astype(np.uint8)
+        things: list[tuple[float, TagMount | Screen, Array]] = [(mount.height, mount, X_W) for mount, X_W in tags]
+        things += [(screen.front, screen, screen.X_W) for screen in screens]
+        for _, thing, X_W in sorted(things, key=lambda thing: thing[0]):
+            if isinstance(thing, Screen):
+                self._cover(grey, thing)
+            else:
+                self._draw(grey, thing, X_W)
+        return grey
+
+    def _cover(self, grey: Array, screen: Screen) -> None:
+        p_W = transform(np.asarray(screen.X_W, float), screen.corners)
+        corners = self.camera.project(np.concatenate([point_in_world(p_W, h) for h in (screen.back, screen.front)]))
+        if not np.isfinite(corners).all():
+            return  # behind the camera
+        outline = cv2.convexHull(corners.astype(np.float32), clockwise=True)[:, 0].astype(float)
+        ends = np.roll(outline, -1, axis=0)
+        self._blend(grey, outline, ends, np.array([[_FINGER], [1.0]]) * np.ones(len(outline)))
 
     def _draw(self, grey: Array, mount: TagMount, X_W_body: Array) -> None:
         start, end, level, cover = _boundaries(mount.id, self._pieces)
@@ -63,39 +110,41 @@ class TagRenderer:
         pixels = self.camera.project(point_in_world(p_W, mount.height))
         if not np.isfinite(pixels).all():
             return  # behind the camera
+        self._blend(grey, pixels[0], pixels[1], np.stack((level, cover)))
+
+    @staticmethod
+    def _blend(grey: Array, start: Array, end: Array, jumps: Array) -> None:
+        """Lay a shape over the picture whose level and cover rise by ``jumps`` (2, n) across segments (n, 2) [px]."""
         height, width = grey.shape
+        pixels = np.stack((start, end))
         low = np.maximum(np.floor(pixels.min(axis=(0, 1)) + 0.5).astype(int), 0)
         high = np.minimum(np.floor(pixels.max(axis=(0, 1)) + 0.5).astype(int) + 1, (width, height))
         if (low >= high).any():
             return
         (x0, y0), (x1, y1) = low, high
         shifted = pixels + 0.5 - low  # pixel (i, j) of the window covers [j, j + 1] × [i, i + 1]
-        value, alpha = _coverage(shifted[0], shifted[1], np.stack((level, cover)), y1 - y0, x1 - x0)
+        value, alpha = _coverage(shifted[0], shifted[1], jumps, y1 - y0, x1 - x0)
         window = grey[y0:y1, x0:x1]
         window *= 1 - alpha
         window += value
 
 
-class SimTagCamera(TagCamera):
-    """The tag camera of the simulated station. ``noise`` is the standard deviation of a pixel in grey levels.
+class SimTagCamera(Faulty[TagReading], TagCamera):
+    """The tag camera of the simulated station, with the errors of the world's profile.
+
+    It describes itself as it was calibrated, and takes its pictures as it is.
 
     In lockstep a frame is exposed only when `capture` asks for one; in real time the world asks at ``config.rate``.
     """
 
-    def __init__(
-        self,
-        name: str,
-        config: TagCameraConfig,
-        world: TagWorld,
-        *,
-        noise: float = 0.0,
-        rng: np.random.Generator | None = None,
-    ):
+    def __init__(self, name: str, config: TagCameraConfig, world: TagWorld):
         super().__init__(name, buffer=256)
         self._config, self._world = config, world
-        self.camera = CameraModel.looking_at(config.position, config.look_at, config.focal, config.width, config.height)
-        self._renderer = TagRenderer(self.camera)
-        self._noise, self._rng = noise, rng or np.random.default_rng(0)
+        self._pinhole = CameraModel.looking_at(
+            config.position, config.look_at, config.focal, config.width, config.height
+        )
+        self._rng = np.random.default_rng(0)
+        self._equip()
         self._detector: TagDetector | None = None
         self._image: ImageReading | None = None
         self._sequence = 0
@@ -119,17 +168,18 @@ class SimTagCamera(TagCamera):
         """Expose a frame at this instant and report the tags found in it."""
         self._need_connection("capture")
         assert self._detector is not None
-        picture = self._renderer.render(self._world.visible_tags())
-        if self._noise > 0:
-            noisy = picture + self._rng.normal(0.0, self._noise, picture.shape)
-            picture = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        figures = self._figures
+        while figures.dropout and self._rng.random() < figures.dropout:
+            self._sequence += 1  # a frame that never arrives; the next one is waited for
+        picture, status = self._developed(exposed(self._seen(), figures, self._rng), noisy=figures.noise > 0)
         now = self._world.now_ns()
-        stamp = Stamp(now, now, self._sequence, self.name)
+        stamp = Stamp(now, now, self._sequence, self.name, status)
         self._sequence += 1
         self._image = ImageReading(stamp, picture, "mono8")
         reading = TagReading(stamp, self._detector.detect(picture), self._detector.family)
-        self._push(reading)
-        return reading
+        if figures.latency:
+            reading = received(reading, now + round(figures.latency * 1e9))
+        return self._hand_out(reading, timeout)
 
     def image(self) -> ImageReading | None:
         """The picture (mono8) behind the newest `capture`."""
@@ -138,12 +188,45 @@ class SimTagCamera(TagCamera):
     def restart(self, rng: np.random.Generator | None = None) -> None:
         """Begin a new epoch after the world was reset, with ``rng``'s noise: frames count from 0, old ones are gone."""
         self._rng = rng or self._rng
+        self._equip()
+        if self._detector is not None:
+            self._shut()
+            self._open(0.0)
         self._forget()
         self._sequence = 0
         self._image = None
 
+    def _equip(self) -> None:
+        """The camera that this lab has, by the profile and the epoch's random numbers."""
+        self._figures = figures = self._world.profile.camera
+        self.camera = calibrated(self._pinhole, figures)
+        self._renderer = TagRenderer(actual(self.camera, figures, self._rng))
+
+    def _seen(self) -> Array:
+        """The picture while the shutter is open, in grey levels."""
+        tags, screens, render = self._world.visible_tags(), self._world.screens(), self._renderer
+        duration = self._figures.exposure_time
+        moving = self._world.tag_twists() if duration else {}
+        moving = {id: twist for id, twist in moving.items() if self._smear(twist) * duration > _SMEAR}
+        if not moving:
+            return render.paint(tags, screens)
+        pictures = []
+        for t in (np.arange(_POSES) + 0.5) / _POSES * duration - duration / 2:
+            at = [(mount, X_W + t * moving[mount.id] if mount.id in moving else X_W) for mount, X_W in tags]
+            pictures.append(render.paint(at, screens))
+        return np.mean(pictures, axis=0)
+
+    def _smear(self, twist: Array) -> float:
+        """Speed in the picture [px/s] of a tag at most 0.1 m from its body's origin."""
+        speed = np.hypot(twist[0], twist[1]) + 0.1 * abs(twist[2])
+        return float(
+            speed * self._config.focal / np.linalg.norm(np.subtract(self._config.look_at, self._config.position))
+        )
+
     def _open(self, timeout: float) -> None:
-        self._detector = TagDetector()
+        self._detector = TagDetector(
+            camera=self.camera if self.camera.distortion.any() else None, blur=0.8 if self._figures.noise else 0.0
+        )
 
     def _shut(self) -> None:
         if self._detector is not None:

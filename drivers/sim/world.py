@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from math import inf
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 
-from drivers.config import StationConfig, WorldConfig
-from drivers.errors import DeviceFault
+from drivers.config import StationConfig, TactileConfig, WorldConfig
+from drivers.errors import CommandRefused, DeviceFault
+from drivers.fault import Fault
 from drivers.interfaces import Device, Sensor
 from drivers.scene import Scene, TagMount
 from drivers.sim.arm import SimArm
 from drivers.sim.device import Simulated
+from drivers.sim.faults import Faults, Faulty
 from drivers.sim.finger import FingerView
 from drivers.sim.force_torque import SimForceTorque
 from drivers.sim.gripper import SimGripper
-from drivers.sim.mismatch import load_profile
+from drivers.sim.mismatch import Lab, load_profile, stream
 from drivers.sim.plant import ZERO, Plant
+from drivers.sim.screen import FINGER_HALF_SIZE, Screen
 from mechanics import se2
 from mechanics.readings import Array, Stamp, TruthReading
+from mechanics.yaml_input import Document, InputError, Refusal, parse
 
 
 def _tag_camera(name: str, config: Any, world: World) -> Device:
@@ -65,6 +70,7 @@ class World:
             raise ValueError(f"station '{config.name}': it has no simulated world; give it a `world:` section")
         self.config = config
         self._set_world(config.world)
+        self.lab = Lab(self.profile, 0)
         self._timestep = config.world.timestep
         self._timestep_ns = round(self._timestep * 1e9)
         self.lockstep = config.world.clock == "lockstep"
@@ -78,10 +84,15 @@ class World:
             raise ValueError(f"devices: a simulated world has one arm, not {', '.join(arm.name for arm in arms)}")
         self._arm = arms[0] if arms else None
         self._sensors = tuple(device for device in self.devices.values() if isinstance(device, Simulated))
+        self.faults = Faults({name: d.line for name, d in self.devices.items() if isinstance(d, Faulty)})
 
     def _set_world(self, world: WorldConfig) -> None:
-        self.profile = load_profile(world.profile)
+        try:
+            self.profile = load_profile(world.profile)
+        except InputError as error:
+            raise ValueError(str(error)) from None
         self._stiffness_scale = world.stiffness_scale
+        self._faults = world.faults
 
     # -- Clock ---------------------------------------------------------------------------------------------------
 
@@ -101,45 +112,81 @@ class World:
     def advance(self, seconds: float) -> int:
         """Step the world through ``seconds``; returns the steps taken.
 
-        What does not fill a step is kept for the next call. Raises DeviceFault when the plant has diverged or there
-        is no scene, ValueError for a time that is negative or not finite.
+        What does not fill a step is kept for the next call. Raises SimulationDiverged when the plant has
+        diverged, DeviceFault while there is no scene, ValueError for a time that is negative or not finite.
         """
+        self._need_life("advance")
         plant = self.plant("world", "advance")
         if not 0 <= seconds < 1e6:
             raise ValueError(f"world: cannot advance by {seconds} s; expected a finite time that is not negative")
         self._owed_ns += round(seconds * 1e9)
         steps, self._owed_ns = divmod(self._owed_ns, self._timestep_ns)
-        dt, arm, sensors, (bx, by, bt) = self._timestep, self._arm, self._sensors, self.profile.arm_bias
+        dt, arm, sensors = self._timestep, self._arm, self._sensors
         for _ in range(steps):
             if arm is None:
                 plant.step(plant.ee_pose, ZERO)
             else:
                 arm.advance(dt)
-                x, y, theta = arm.pose
-                plant.step((x + bx, y + by, theta + bt), arm.twist)
+                plant.step(arm.true_pose, arm.true_twist)
             self._steps += 1
+            if self.faults.next_ns <= self.now_ns():
+                self.faults.update(self.now_ns())
+                self._need_life("advance")
             for sensor in sensors:
                 sensor.sample()
         return steps
 
+    # -- faults --------------------------------------------------------------------------------------------------
+
+    def inject(self, fault: Fault | dict) -> None:
+        """Let a fault happen; its times count from now. Raises CommandRefused for one that cannot be here."""
+        try:
+            fault = fault if isinstance(fault, Fault) else parse(Fault, Document(fault, {}, "fault"))
+            fault.suit({name: device.kind for name, device in self.config.devices.items()})
+        except (InputError, Refusal) as error:
+            problem = error.problems[0] if isinstance(error, InputError) else error
+            expected = f"Expected is {problem.expected}" if problem.expected else "Correct the fault"
+            near = f"; nearest is {problem.nearest}" if problem.nearest else ""
+            raise CommandRefused("world", "inject a fault", problem.wrong, expected + near) from None
+        self.faults.inject(fault, self.now_ns())
+
+    def clear_faults(self) -> None:
+        """End every fault; a device that has gone is back, and has to be closed and connected again."""
+        self.faults.clear(self.now_ns())
+
+    def _need_life(self, asked: str) -> None:
+        if self.faults.crashed:
+            raise DeviceFault("world", asked, "the simulated world has crashed", "Start the station again")
+
     # -- Simulation ----------------------------------------------------------------------------------------------
 
     def reset(self, seed: int, scene: Scene | dict, world: WorldConfig | None = None) -> None:
-        """Put ``scene`` into its initial state; ``world`` replaces the profile and the stiffness scale.
+        """Put ``scene`` into its initial state; ``world`` replaces profile, stiffness scale and faults.
+
+        The plant differs from the scene by what the profile comes to for ``seed``; the go lies in the fingers as the
+        scene says until `regrasp`.
 
         Devices stay as connected, leased and stopped as they were, the arm rests at the scene's start, tares are
         undone, and every stream starts again at 0: its first reading comes one period later. Raises ValueError
         (pydantic's among them) for a scene that cannot be; the world is then as it was.
         """
         scene = scene if isinstance(scene, Scene) else Scene.model_validate(scene)
-        before = self.profile, self._stiffness_scale
+        self._need_life("reset")
+        before = self.profile, self._stiffness_scale, self._faults, self.lab
         if world is not None:
             self._set_world(world)
+        self.lab = Lab(self.profile, seed)
         try:
-            start = tuple(a + b for a, b in zip(scene.start, self.profile.arm_bias, strict=True))
-            plant = Plant(scene.model_copy(update={"start": start}), self._stiffness_scale, self._timestep)
+            fingers = self.profile.fingers
+            plant = Plant(
+                self._actual(scene),
+                self._stiffness_scale,
+                self._timestep,
+                self.profile.membrane,
+                (fingers.force_limit or inf, fingers.torque_limit or inf),
+            )
         except (ValueError, DeviceFault):
-            self.profile, self._stiffness_scale = before
+            self.profile, self._stiffness_scale, self._faults, self.lab = before
             raise
         self._plant, self.scene, self.seed = plant, scene, seed
         self._steps = self._owed_ns = 0
@@ -149,9 +196,34 @@ class World:
                 # a stream of its own per device: adding one leaves the others' noise as it was
                 device.restart(np.random.default_rng([seed, crc32(name.encode())]))
             elif (restart := getattr(device, "restart", None)) is not None:
-                restart()
+                restart(np.random.default_rng([seed, crc32(name.encode())]))
         if self._arm is not None:
             self._arm.place(scene.start)
+        self.faults.restart(self._faults, seed, self.now_ns())
+
+    def _actual(self, scene: Scene) -> Scene:
+        """The scene as it truly is in this lab."""
+        start = tuple(a + b for a, b in zip(scene.start, self.lab.arm_bias, strict=True))
+        stiffness = tuple(tuple(row) for row in self.lab.stiffness(scene.stiffness).tolist())
+        changed = {"start": start, "stiffness": stiffness, "friction": self.lab.friction(scene.friction)}
+        return scene.model_copy(update=changed)
+
+    def regrasp(self, trial: int) -> None:
+        """Take the go into the fingers anew, as between trials, and draw what no calibration removes.
+
+        How the go lies in the fingers, what the handling leaves in their membranes and the arm's errors of
+        repeatability follow from the seed and ``trial`` (from 0) alone. No time passes; the go hangs at rest. A
+        profile without such errors leaves everything as it is.
+        Raises DeviceFault while there is no scene, CommandRefused where the go would touch something.
+        """
+        plant = self.plant("world", "regrasp")
+        if trial < 0:
+            raise CommandRefused("world", "regrasp", f"trial {trial}", "Trials count from 0")
+        if self._arm is not None and self.profile.arm.repeatability.si.any():
+            self._arm.begin_trial(stream(self.seed, "arm.trial", trial))
+        offset, fresh = self.lab.grasp_offset(trial), not plant.membrane.is_linear or min(plant.finger_limit) < inf
+        if plant.held and (fresh or offset.any()):
+            plant.regrasp(se2.compose(np.array(self.scene.grasp), offset), self.lab.membrane_strain(trial))
 
     def truth(self) -> TruthReading:
         """The plant's own state at this instant; its sequence number is that of the plant step."""
@@ -162,9 +234,19 @@ class World:
             plant.ee,
             plant.go,
             plant.eo,
-            plant.coupling_wrench(),
+            plant.coupling_wrench(self._believed_grasp(plant)),
             plant.contacts(),
         )
+
+    def _believed_grasp(self, plant: Plant) -> Array | None:
+        """The scene's grasp centre in W, about which plans and errors count torques; None where it is the true one."""
+        if tuple(plant.coupling.grasp) == self.scene.grasp:
+            return None
+        return se2.compose(plant.go, np.array(self.scene.grasp))[:2]
+
+    def health(self) -> dict[str, Any]:
+        """How well the plant was since the reset: `drivers.sim.health.Health.summary`."""
+        return self.plant("world", "tell its health").health()
 
     def counts(self) -> dict[str, int]:
         """Readings per device since the reset."""
@@ -193,7 +275,7 @@ class World:
         plant = self.plant("world", "feel the held object")
         outline = np.array(self.scene.grasped.vertices, float)
         X_ee_go = se2.between(plant.ee, plant.go)
-        X_ee_gocf = se2.compose(X_ee_go, np.array(self.scene.grasp))
+        X_ee_gocf = se2.compose(X_ee_go, plant.coupling.grasp)
         return FingerView(outline, X_ee_go, X_ee_gocf, plant.held)
 
     def visible_tags(self) -> list[tuple[TagMount, Array]]:
@@ -203,4 +285,25 @@ class World:
         for body, pose in ((self.scene.grasped, plant.go), (self.scene.extrinsic, plant.eo)):
             if body is not None and body.tag is not None and pose is not None:
                 tags.append((body.tag, pose))
-        return tags
+        if not self.profile.camera.tag_bias.si.any():
+            return tags
+        return [(self._as_it_sits(mount), pose) for mount, pose in tags]
+
+    def tag_twists(self) -> dict[int, Array]:
+        """Velocity (3,) in W, (ẋ, ẏ, θ̇), of the objects, by the ids of their tags."""
+        plant = self.plant("world", "look at the tags")
+        bodies = {"go": self.scene.grasped, "eo": self.scene.extrinsic}
+        return {body.tag.id: plant.twist(name) for name, body in bodies.items() if body is not None and body.tag}
+
+    def screens(self) -> list[Screen]:
+        """What stands in front of the tags: the finger on the viewer's side, where the station has fingers."""
+        plant = self.plant("world", "look at the tags")
+        fingers = [d for d in self.config.devices.values() if isinstance(d, TactileConfig) and d.finger == "left"]
+        if not fingers and not any(device.kind == "gripper" for device in self.config.devices.values()):
+            return []
+        sensor = fingers[0].sensor if fingers else "soft_bubble"
+        return [Screen(plant.ee, FINGER_HALF_SIZE[sensor])]
+
+    def _as_it_sits(self, mount: TagMount) -> TagMount:
+        x, y, angle = se2.compose(np.array(mount.pose), self.lab.tag_bias(mount.id)).tolist()
+        return mount.model_copy(update={"pose": (x, y, angle)})

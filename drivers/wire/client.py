@@ -10,13 +10,26 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from typing import Any, ClassVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, DriverError, NotConnected, ProtocolError
-from drivers.interfaces import Arm, ArmTarget, Description, ForceTorqueSensor, Gripper, R, Sensor, TagCamera
+from drivers.interfaces import (
+    Arm,
+    ArmTarget,
+    Description,
+    ForceTorqueSensor,
+    Gripper,
+    R,
+    Sensor,
+    TactileSensor,
+    TagCamera,
+    freshness,
+)
 from drivers.wire import messages, topics
 from drivers.wire.arm_server import holder_id
 from drivers.wire.bus import Bus, Sample, Subscription, Watch
@@ -41,7 +54,7 @@ class RemoteSensor(Sensor[R]):
         self._subscription: Subscription | None = None
         self._stop_listening: Callable[[], None] = lambda: None
         self._newest_capture = 0
-        self._corrupt = 0
+        self._still = lockstep
 
     def describe(self) -> Description:
         """What the device says of itself; asks its server. Raises DeviceTimeout, DeviceFault, ProtocolError."""
@@ -54,7 +67,11 @@ class RemoteSensor(Sensor[R]):
 
     @property
     def corrupt(self) -> int:
-        """Messages that arrived and could not be read."""
+        """Messages that arrived since connecting and could not be read; what nobody has read yet is read for it."""
+        with self._arrived:
+            unread = [sample for sample in self._kept if sample.reading is None]
+        for _ in self._readable(unread):
+            pass
         return self._corrupt
 
     def _open(self, timeout: float) -> None:
@@ -74,9 +91,13 @@ class RemoteSensor(Sensor[R]):
             )
         self._subscription = bus.subscribe(topics.key(self._link.station, self.name, self._stream))
         self._stop_listening = self._subscription.listen(self._receive)
-        kind = self.describe().kind  # the answer also says that the subscription has reached the server
-        if kind != self.kind:
-            raise NotConnected(self.name, "connect", f"it is a {kind}, not a {self.kind}", "Check the station file")
+        said = self.describe()  # the answer also says that the subscription has reached the server
+        if said.kind != self.kind:
+            raise NotConnected(
+                self.name, "connect", f"it is a {said.kind}, not a {self.kind}", "Check the station file"
+            )
+        self._type = topics.streams_of(said.kind, said.extra.get("sensor", ""))[self._stream]
+        self.max_age = freshness(said.rate)
 
     def _shut(self) -> None:
         self._stop_listening()
@@ -102,6 +123,7 @@ class RemoteSensor(Sensor[R]):
             if last is not None and (sample.sequence <= last or sample.capture_ns < self._newest_capture):
                 self._kept.clear()  # the world was reset: what came before is of another time
                 last = None
+                self._link.now_ns = min(self._link.now_ns, sample.capture_ns)
             if last is not None:
                 self._gaps += sample.sequence - last - 1
             self._last_sequence, self._newest_capture = sample.sequence, sample.capture_ns
@@ -109,20 +131,30 @@ class RemoteSensor(Sensor[R]):
             self._arrived.notify_all()
             listeners = self._listeners
         if listeners:
-            try:
-                reading = self._decode(sample)
-            except ProtocolError:
-                self._corrupt += 1
-                return
-            for listener in listeners:
-                listener(reading)
+            for reading in self._readable([sample]):
+                for listener in listeners:
+                    listener(reading)
 
     def _decode(self, sample: Sample) -> R:
         if sample.reading is None:
-            sample.reading = decode_reading(
-                self._type, sample.payload, sample.sequence, sample.status, sample.receive_ns
-            )
+            try:
+                sample.reading = decode_reading(
+                    self._type, sample.payload, sample.sequence, sample.status, sample.receive_ns
+                )
+            except ProtocolError as error:
+                sample.reading = ProtocolError(self.name, error.asked, error.got, error.remedy)
+                self._corrupt += 1
+        if isinstance(sample.reading, ProtocolError):
+            raise sample.reading.with_traceback(None)
         return cast("R", sample.reading)
+
+    def _readable(self, samples: Iterable[Sample]) -> Iterator[R]:
+        for sample in samples:
+            with suppress(ProtocolError):  # counted
+                yield self._decode(sample)
+
+    def _station_ns(self) -> int:
+        return self._link.now_ns if self._lockstep else time.time_ns()
 
     def forget(self) -> None:
         """Drop what was received: the world is about to be reset."""
@@ -134,28 +166,22 @@ class RemoteSensor(Sensor[R]):
         super()._forget()
 
     def latest(self, timeout: float = 1.0) -> R:
-        """As `Sensor.latest`; raises DeviceFault when the server has died, ProtocolError for garbage."""
+        """As `Sensor.latest`; raises DeviceFault when the server has died."""
         self._need_connection("read")
         watch = self._need_life("read")
-        deadline = time.monotonic() + timeout
         withdraw = watch.once_gone(self._wake)
         try:
             with self._arrived:
-                while not self._kept:
-                    left = deadline - time.monotonic()
-                    if left <= 0:
-                        raise DeviceTimeout(
-                            self.name, "read", f"no reading within {timeout:g} s", "Check `extrinsic status STATION`"
-                        )
-                    self._arrived.wait(left)
-                    self._need_life("read")
+                self._await(
+                    lambda: self._kept[-1].capture_ns if self._kept else None, timeout, lambda: self._need_life("read")
+                )
                 sample = self._kept[-1]
         finally:
             withdraw()
         return self._decode(sample)
 
     def since(self, capture_ns: int) -> list[R]:
-        """As `Sensor.since`; raises DeviceFault when the server has died, ProtocolError for garbage."""
+        """As `Sensor.since`; raises DeviceFault when the server has died."""
         self._need_connection("read")
         self._need_life("read")
         found: list[Sample] = []
@@ -164,7 +190,7 @@ class RemoteSensor(Sensor[R]):
                 if sample.capture_ns <= capture_ns:
                     break
                 found.append(sample)
-        return [self._decode(sample) for sample in reversed(found)]
+        return list(self._readable(reversed(found)))
 
     def arrivals(self, since_ns: int) -> list[int]:
         """When the kept readings arrived, after ``since_ns`` [ns, Unix time; capture times in lockstep]."""
@@ -209,6 +235,36 @@ class RemoteTagCamera(RemoteSensor[TagReading], TagCamera):
         """The picture behind the newest `capture`, without loss."""
         reply = self._command("image", asked="send its picture")
         return cast("ImageReading", decode_reading(reply.type, reply.data.tobytes(), 0)) if reply.type else None
+
+
+class RemoteTactile(RemoteSensor[ImageReading], TactileSensor):
+    """A tactile finger on the bus."""
+
+    kind = "tactile"
+
+    def capture(self, timeout: float = 2.0) -> ImageReading:
+        """As `ImagingSensor.capture`. A frame that is lost on its way is made up for by the next one of the stream."""
+        deadline = time.monotonic() + timeout
+        wanted = json.loads(self._command("capture", timeout=timeout).text)
+        with self._arrived:
+            while not self._kept or self._kept[-1].sequence < wanted:
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    raise DeviceTimeout(
+                        self.name,
+                        "capture",
+                        f"its frame did not arrive within {timeout:g} s",
+                        "Check the network's load",
+                    )
+                self._arrived.wait(min(left, 0.05))
+                self._need_life("capture")
+            sample = self._kept[-1]
+        return self._decode(sample)
+
+    def reference(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """As `TactileSensor.reference`."""
+        reply = self._command("reference", asked="send its reference picture")
+        return cast("ImageReading", decode_reading(reply.type, reply.data.tobytes(), 0)).image
 
 
 class RemoteGripper(RemoteSensor[GripperReading], Gripper):
@@ -329,7 +385,7 @@ class RemoteArm(RemoteSensor[PoseReading], Arm):
 
 
 REMOTES: dict[str, type[RemoteSensor]] = {
-    remote.kind: remote for remote in (RemoteArm, RemoteGripper, RemoteForceTorque, RemoteTagCamera)
+    remote.kind: remote for remote in (RemoteArm, RemoteGripper, RemoteForceTorque, RemoteTagCamera, RemoteTactile)
 }
 """The remote device of each kind."""
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 from drivers.errors import DeviceFault
+from drivers.fault import Fault
 from drivers.wire import messages, topics
 from drivers.wire.bus import Watch
 from drivers.wire.client import RemoteSensor
@@ -74,10 +75,36 @@ class RemoteSimulation:
         reply = self._link.ask(topics.WORLD, "reset", payload, watch=self._watch)
         self._link.now_ns = reply.now_ns
 
+    def regrasp(self, trial: int) -> None:
+        """As `Simulation.regrasp`. Raises DeviceFault while there is no scene, CommandRefused where it cannot be."""
+        payload = messages.encode(messages.message(messages.INTEGER, data=trial))
+        self._link.ask(topics.WORLD, "regrasp", payload, watch=self._watch)
+
+    def inject(self, fault: Fault | dict) -> None:
+        """As `Simulation.inject`. A crash takes the host with it before it could answer."""
+        text = fault.model_dump_json() if isinstance(fault, Fault) else json.dumps(fault)
+        try:
+            self._tell("inject", text)
+        except DeviceFault:
+            if json.loads(text).get("kind") != "crash":
+                raise
+
+    def clear_faults(self) -> None:
+        """As `Simulation.clear_faults`."""
+        self._tell("clear_faults", "")
+
+    def _tell(self, verb: str, text: str) -> None:
+        payload = messages.encode(messages.message(messages.STRING, data=text))
+        self._link.ask(topics.WORLD, verb, payload, watch=self._watch)
+
     def truth(self) -> TruthReading:
         """As `Simulation.truth`."""
         reply = self._link.ask(topics.WORLD, "truth", watch=self._watch)
         return cast("TruthReading", decode_reading(reply.type, reply.data.tobytes(), 0))
+
+    def health(self) -> dict[str, Any]:
+        """As `Simulation.health`."""
+        return json.loads(self._link.ask(topics.WORLD, "health", watch=self._watch).text)
 
     def counts(self) -> dict[str, int]:
         """As `Simulation.counts`: messages put on the bus; a stream that nobody hears is not put there."""

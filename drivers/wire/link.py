@@ -5,7 +5,15 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, DriverError, NotConnected, ProtocolError
+from drivers.errors import (
+    CommandRefused,
+    DeviceFault,
+    DeviceTimeout,
+    DriverError,
+    NotConnected,
+    ProtocolError,
+    SimulationDiverged,
+)
 from drivers.wire import messages, topics
 from drivers.wire.bus import Bus, Watch
 
@@ -63,4 +71,6 @@ def _error(reply: Any) -> DriverError:
             return DeviceTimeout(device, asked, got, remedy)
         case 4:
             return NotConnected(device, asked, got, remedy)
+        case 6:
+            return SimulationDiverged(device, asked, got, remedy, reply.recoverable)
     return ProtocolError(device, asked, got, remedy)

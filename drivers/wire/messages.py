@@ -29,6 +29,7 @@ REPLY = "extrinsic_msgs/msg/Reply"
 RESET = "extrinsic_msgs/msg/Reset"
 STRING = "std_msgs/msg/String"
 FLOAT = "std_msgs/msg/Float64"
+INTEGER = "std_msgs/msg/Int64"
 EMPTY = "std_msgs/msg/Empty"
 DURATION = "builtin_interfaces/msg/Duration"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import threading
@@ -13,23 +14,35 @@ from typing import Self
 
 import numpy as np
 
-from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, DriverError, NotConnected, ProtocolError
-from drivers.interfaces import Device, ForceTorqueSensor, Gripper, ImagingSensor, Sensor, TagCamera
+from drivers.errors import (
+    CommandRefused,
+    DeviceFault,
+    DeviceTimeout,
+    DriverError,
+    NotConnected,
+    ProtocolError,
+    SimulationDiverged,
+)
+from drivers.interfaces import Device, ForceTorqueSensor, Gripper, ImagingSensor, Sensor, TactileSensor, TagCamera
 from drivers.wire import messages, topics
 from drivers.wire.bus import Bus, Publisher, Query
 from drivers.wire.codec import Reading, encode_compressed, encode_reading
-from mechanics.readings import ImageReading
+from mechanics.readings import ImageReading, Stamp
 
 log = logging.getLogger(__name__)
 
+_RUINS = b"\xff\xff\xff\xff\xff\xff\xff"
+"""Bytes that no type decodes: stands for a damaged message of the device, whose own bytes the bus does not carry."""
+
 OUTCOMES: tuple[tuple[int, type[DriverError]], ...] = (
     (1, CommandRefused),
+    (6, SimulationDiverged),
     (2, DeviceFault),
     (3, DeviceTimeout),
     (4, NotConnected),
     (5, ProtocolError),
 )
-"""Reply.outcome of each error; 0 is success."""
+"""Reply.outcome of each error, the particular before the general; 0 is success."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +104,12 @@ class Desk:
         """Announce a stream. Images may be dropped on their way to a slow viewer, everything else arrives."""
         lossy = not self._keep_all and type_name in (messages.IMAGE, messages.COMPRESSED_IMAGE)
         publisher = self.bus.publisher(topics.key(self.station, device, stream), type_name, lossy)
+        for old in [known for known in self.publishers if known.topic == publisher.topic]:
+            # a device that comes back goes on with its stream
+            publisher.count, publisher.newest = old.count, old.newest
+            self.publishers.remove(old)
+            if old in self._lossless:
+                self._lossless.remove(old)
         self.publishers.append(publisher)
         if not lossy:
             self._lossless.append(publisher)
@@ -179,10 +198,10 @@ class DeviceServer:
         """Connect the device, announce its streams, answer its verbs; then say that it is alive."""
         device, description = self.device, self.device.describe()
         device.connect()
-        for stream, type_name in topics.STREAMS[description.kind].items():
+        for stream, type_name in topics.streams_of(description.kind, description.extra.get("sensor", "")).items():
             self._streams[stream] = self.desk.publisher(device.name, stream, type_name)
         if isinstance(device, Sensor):
-            self._stops.append(device.listen(self._publish))
+            self._stops.append(device.listen(self._publish, self._publish_ruins))
         self._serve("describe", lambda _: Answer(json.dumps(asdict(self.device.describe()))), direct=True)
         self._verbs()
         self._withdraw = self.desk.bus.token(topics.alive(self.desk.station, device.name))
@@ -210,24 +229,31 @@ class DeviceServer:
             self._serve("grasp", lambda payload: device.grasp(messages.decode(payload, messages.FLOAT).data))
             self._serve("release", lambda _: device.release())
         if isinstance(device, ImagingSensor):
-            self._serve("capture", lambda _: self.capture())
+            self._serve("capture", lambda _: Answer(json.dumps(self.capture())))
         if isinstance(device, TagCamera):
             self._serve("image", lambda _: _picture(device.image()))
+        if isinstance(device, TactileSensor):
+            self._serve("reference", lambda _: _reference(device))
 
     def capture_if_wanted(self) -> None:
-        """Take a frame if somebody listens: the stream of a camera that has no thread of its own."""
-        if any(publisher.matched for publisher in self._streams.values()):
-            self.capture()
+        """Take a frame if somebody listens: the stream of a camera that has no thread of its own.
 
-    def capture(self) -> None:
-        """Take a frame; its reading and its picture go out as streams."""
+        A frame that does not come is missing from the stream, where its readers notice.
+        """
+        if any(publisher.matched for publisher in self._streams.values()):
+            with contextlib.suppress(DriverError):
+                self.capture()
+
+    def capture(self) -> int:
+        """Take a frame; its reading and its picture go out as streams. Returns its sequence number."""
         device = self.device
         assert isinstance(device, ImagingSensor)
-        device.capture()
+        reading = device.capture()
         if isinstance(device, TagCamera) and self._streams["image"].matched:
             picture = device.image()
             if picture is not None:
                 self._put_picture(picture)
+        return reading.stamp.sequence
 
     def _publish(self, reading: Reading) -> None:
         if isinstance(reading, ImageReading):
@@ -238,13 +264,27 @@ class DeviceServer:
             shift, stamp = self.desk.shift_ns(), reading.stamp
             publisher.put(encode_reading(reading, shift), stamp.sequence, stamp.capture_ns + shift, int(stamp.status))
 
+    def _publish_ruins(self, stamp: Stamp) -> None:
+        """A message of the device that could not be read arrives at the other end as what it is."""
+        publisher = next(iter(self._streams.values()), None)
+        if publisher is not None and publisher.matched:
+            publisher.put(_RUINS, stamp.sequence, stamp.capture_ns + self.desk.shift_ns(), int(stamp.status))
+
     def _put_picture(self, picture: ImageReading) -> None:
         publisher = self._streams["image"]
         if publisher.matched:
             shift, stamp = self.desk.shift_ns(), picture.stamp
-            publisher.put(
-                encode_compressed(picture, shift), stamp.sequence, stamp.capture_ns + shift, int(stamp.status)
-            )
+            encode = encode_reading if publisher.type_name == messages.IMAGE else encode_compressed
+            publisher.put(encode(picture, shift), stamp.sequence, stamp.capture_ns + shift, int(stamp.status))
+
+
+def _reference(device: TactileSensor) -> Answer:
+    picture = device.reference()
+    encoding = "bgr8" if picture.ndim == 3 else "16UC1" if picture.dtype == np.uint16 else "mono8"
+    return Answer(
+        type=messages.IMAGE,
+        data=encode_reading(ImageReading(Stamp(0, 0, 0, device.describe().frame), picture, encoding)),
+    )
 
 
 def _picture(picture: ImageReading | None) -> Answer | None:

@@ -17,9 +17,13 @@ STREAMS: dict[str, dict[str, str]] = {
     "force_torque": {"wrench": messages.WRENCH},
     "tag_camera": {"detections": messages.DETECTIONS, "image": messages.COMPRESSED_IMAGE},
     "tactile": {"image": messages.COMPRESSED_IMAGE},
+    "tactile/soft_bubble": {"image": messages.IMAGE},
     WORLD: {"truth": messages.TRUTH},
 }
-"""Streams by kind of device, with their types; the first carries the device's readings."""
+"""Streams by kind of device, with their types; the first carries the device's readings.
+
+A tactile finger that measures depth sends it as it is, so that every ROS viewer draws it; colour is compressed.
+"""
 
 
 def key(station: str, device: str, part: str) -> str:
@@ -42,15 +46,20 @@ def holder_of(token: str) -> str:
     return token.rsplit("/", 1)[1]
 
 
+def streams_of(kind: str, sensor: str = "") -> dict[str, str]:
+    """The streams of a device by its kind and, where it has one, the sensor in it."""
+    return STREAMS.get(f"{kind}/{sensor}", STREAMS[kind])
+
+
 def streams(config: StationConfig) -> dict[str, str]:
     """Every stream of a station with its type."""
-    devices = {name: str(device.kind) for name, device in config.devices.items()}
+    devices = {name: streams_of(device.kind, getattr(device, "sensor", "")) for name, device in config.devices.items()}
     if config.world is not None:
-        devices[WORLD] = WORLD
+        devices[WORLD] = STREAMS[WORLD]
     return {
         key(config.name, name, stream): type_name
-        for name, kind in devices.items()
-        for stream, type_name in STREAMS[kind].items()
+        for name, types in devices.items()
+        for stream, type_name in types.items()
     }
 
 

@@ -19,11 +19,13 @@ from drivers.config import (
     ForceTorqueConfig,
     GripperConfig,
     StationConfig,
+    TactileConfig,
     TagCameraConfig,
     WorldConfig,
 )
 from drivers.interfaces import Arm, Clock, Device, Simulation
 from drivers.scene import Body, Scene, TagMount
+from drivers.sim.soft_bubble import view_of
 from drivers.sim.world import World
 from drivers.station import Station
 
@@ -34,7 +36,7 @@ SCENE = Scene(
         name="tall_box",
         vertices=((-0.025, -0.07345), (0.025, -0.07345), (0.025, 0.07345), (-0.025, 0.07345)),
         mass=0.1,
-        tag=TagMount(id=3, size=0.036),
+        tag=TagMount(id=3, size=0.036, pose=(0.0, -0.04, 0.0), height=0.01),  # below the fingers
     ),
     grasp=(0.0, 0.045, 0.0),
     stiffness=((2209.0, 0.0, 0.0), (0.0, 1876.0, 0.0), (0.0, 0.0, 3.2)),
@@ -124,8 +126,13 @@ def opened(request: pytest.FixtureRequest) -> Iterator[Lab]:
             "camera": TagCameraConfig(
                 kind="tag_camera", width=640, height=480, focal=600.0, position=(0, -0.5, 0.2), look_at=(0, 0, 0.2)
             ),
+            "bubble": TactileConfig(kind="tactile", sensor="soft_bubble", finger="left", indentation=0.016),
+            "gel": TactileConfig(kind="tactile", sensor="gelslim", finger="right", width=160, height=120),
         },
     )
+    bubble = config.devices["bubble"]
+    assert isinstance(bubble, TactileConfig)
+    view_of(bubble)  # compiled once per installation, which takes longer than a frame may
     with BACKENDS[request.param](config) as lab:
         yield lab
 
@@ -141,6 +148,18 @@ def lab(opened: Lab) -> Lab:
     arm.recover()
     opened.simulation.reset(0, SCENE)
     return opened
+
+
+@pytest.fixture(params=list(BACKENDS))
+def backend(request: pytest.FixtureRequest) -> Callable[[StationConfig], AbstractContextManager[Lab]]:
+    """The way to open a station of one's own, to be broken."""
+    return BACKENDS[request.param]
+
+
+@pytest.fixture
+def endpoint() -> str:
+    """An endpoint that nobody uses."""
+    return free_endpoint()
 
 
 @pytest.fixture
@@ -159,10 +178,14 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo) -> Itera
     outcome = yield
     report = outcome.get_result()  # pyright: ignore[reportAttributeAccessIssue]
     callspec = getattr(item, "callspec", None)
-    if callspec is None or "opened" not in callspec.params or (report.when != "call" and report.passed):
+    params = {} if callspec is None else callspec.params
+    backend = params.get("opened") or params.get("backend")
+    if backend is None or (report.when != "call" and report.passed):
         return
-    kind = callspec.params.get("kind") or getattr(getattr(item, "function", None), "kind", "station")
-    report.user_properties.append(("conformance", (kind, callspec.params["opened"])))
+    kind = params.get("kind") or getattr(getattr(item, "function", None), "kind", "station")
+    if "fault" in params:
+        kind = f"fault {params['fault']}"
+    report.user_properties.append(("conformance", (kind, backend)))
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:

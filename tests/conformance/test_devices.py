@@ -12,10 +12,11 @@ import pytest
 
 from drivers.errors import CommandRefused, DeviceTimeout, NotConnected
 from drivers.interfaces import ArmTarget
+from mechanics.readings import Status
 
 #: name in the station of one device per kind
-NAMES = {"arm": "arm", "gripper": "gripper", "force_torque": "wrist_ft", "tag_camera": "camera"}
-STREAMING = [kind for kind in NAMES if kind != "tag_camera"]
+NAMES = {"arm": "arm", "gripper": "gripper", "force_torque": "wrist_ft", "tag_camera": "camera", "tactile": "bubble"}
+STREAMING = [kind for kind in NAMES if kind not in ("tag_camera", "tactile")]
 
 every_kind = pytest.mark.parametrize("kind", NAMES)
 every_stream = pytest.mark.parametrize("kind", STREAMING)
@@ -359,3 +360,67 @@ def describes_its_camera(camera) -> bool:
 
     model = CameraModel.from_dict(camera.describe().extra["camera"])
     return (model.width, model.height) == (640, 480)
+
+
+#: both tactile sensors, with what their pictures are
+FINGERS = {"bubble": ((171, 224), np.uint16, "16UC1"), "gel": ((120, 160, 3), np.uint8, "bgr8")}
+every_finger = pytest.mark.parametrize("name", FINGERS)
+
+
+@about("tactile")
+@every_finger
+def test_finger_captures_at_the_present_instant(lab, name):
+    finger, (shape, dtype, encoding) = lab.devices[name], FINGERS[name]
+    lab.clock.sleep(0.1)
+    first = finger.capture()
+    assert first.stamp.capture_ns == lab.clock.now_ns() == 100_000_000
+    assert (first.image.shape, first.image.dtype, first.encoding) == (shape, dtype, encoding)
+    assert first.stamp.frame == finger.describe().frame
+    lab.clock.sleep(0.1)
+    second = finger.capture()
+    assert second.stamp.sequence == first.stamp.sequence + 1
+    assert finger.latest().stamp == second.stamp
+    assert [reading.stamp for reading in finger.since(0)] == [first.stamp, second.stamp]
+    assert finger.gaps == 0
+
+
+@about("tactile")
+@every_finger
+def test_finger_takes_no_frame_unless_asked(lab, name):
+    finger = lab.devices[name]
+    lab.clock.sleep(0.3)
+    assert finger.since(0) == []
+
+
+@about("tactile")
+@every_finger
+def test_finger_feels_what_it_holds(lab, name):
+    finger = lab.devices[name]
+    lab.clock.sleep(0.1)
+    reference = finger.reference()
+    assert reference.shape == FINGERS[name][0] and reference.dtype == FINGERS[name][1]
+    held = finger.capture()
+    assert held.stamp.status is Status.OK
+    lab.devices["gripper"].release()
+    lab.clock.sleep(0.1)
+    empty = finger.capture()
+    assert empty.stamp.status is Status.NO_CONTACT
+
+    def differs(picture):
+        return np.abs(picture.astype(int) - reference).mean()
+
+    assert differs(held.image) > 3 * (differs(empty.image) + 0.5)
+
+
+@about("tactile")
+@every_finger
+def test_finger_says_which_it_is(lab, name):
+    from mechanics.camera import CameraModel
+
+    said, (shape, _, encoding) = lab.devices[name].describe(), FINGERS[name]
+    assert said.extra["sensor"] == {"bubble": "soft_bubble", "gel": "gelslim"}[name]
+    assert said.extra["finger"] == {"bubble": "left", "gel": "right"}[name]
+    assert said.extra["encoding"] == encoding
+    camera = CameraModel.from_dict(said.extra["camera"])
+    assert (camera.height, camera.width) == shape[:2]
+    assert np.array(said.extra["X_ee_finger"]).shape == (4, 4)

@@ -43,6 +43,15 @@ def test_turning_about_the_sticking_corner_is_no_slip(monitor):
     assert monitor.check(1, state(go=(0.0, 0.0, 0.3)), NO_WEIGHT) is None
 
 
+def test_a_corner_that_landed_elsewhere_has_to_stick_where_it_landed(plan):
+    # the object was seen 6 mm to the right in free air, and 2 mm too high, which touching down takes away
+    monitor = ContactMonitor(plan, 0.005, 30.0, lies=np.array([0.006, 0.002, 0.0]))
+    assert monitor.check(0, state(go=(0.006, 0.0, 0.0)), NO_WEIGHT) is None
+    deviation = monitor.check(1, state(go=(0.0, 0.0, 0.0)), NO_WEIGHT)
+    assert deviation is not None
+    assert deviation.status == "slipped" and "6.0 mm" in deviation.reason
+
+
 def test_a_force_beyond_the_limit_stops(monitor):
     assert monitor.check(0, state(wrench=(0.0, -31.0, 0.0)), NO_WEIGHT).status == "stopped"
 

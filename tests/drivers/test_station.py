@@ -20,6 +20,7 @@ import pytest
 from drivers.config import StationConfig
 from drivers.errors import CommandRefused, DeviceFault, DriverError, NotConnected
 from drivers.interfaces import ArmTarget
+from drivers.sim.world import World
 from drivers.station import Devices, Station, listening
 from drivers.wire.bus import Bus, open_buses
 from drivers.wire.log_reader import LogReader
@@ -346,6 +347,34 @@ def test_a_host_takes_profile_and_stiffness_from_the_run_that_joins(devices: Dev
             truth = joined.simulation.truth()
             sags.append(truth.ee[1] - truth.go[1])
         assert sags[1] - sags[0] == pytest.approx(MASS * 9.81 / 2000.0, rel=1e-3)  # half the stiffness, twice the sag
+
+
+def test_a_new_grasp_over_the_bus_is_that_of_the_seed_and_the_trial(devices: Devices, config: StationConfig) -> None:
+    simulation = devices.simulation
+    assert simulation is not None and config.world is not None
+    lab = config.world.model_copy(update={"profile": "lab"})
+    here = World(config.model_copy(update={"world": lab}))
+    for trial in (5, 6):
+        simulation.reset(3, scene(), lab.model_dump())
+        simulation.regrasp(trial)
+        here.reset(3, scene())
+        here.regrasp(trial)
+        assert devices.clock.now_ns() == 0
+        np.testing.assert_array_equal(simulation.truth().go, here.truth().go)
+    with pytest.raises(CommandRefused, match="Trials count from 0"):
+        simulation.regrasp(-1)
+
+
+def test_dropouts_are_counted_by_who_receives_over_the_bus(devices: Devices, tmp_path: Path) -> None:
+    profile = tmp_path / "lossy.yaml"
+    profile.write_text("force_torque: {dropout: 0.02}\n")
+    assert devices.simulation is not None
+    devices.simulation.reset(0, scene(), {"profile": str(profile)})
+    devices.clock.sleep(2.0)
+    wrist = devices.force_torque("wrist")
+    received = [reading.stamp.sequence for reading in wrist.since(-1)]
+    assert wrist.gaps == received[-1] - received[0] + 1 - len(received) > 10
+    assert devices.arm.gaps == 0
 
 
 def test_a_foreign_program_at_the_endpoint_is_told(config: StationConfig) -> None:

@@ -67,3 +67,20 @@ def test_only_trustworthy_readings_are_averaged():
     assert mean_wrench([reading(1.0, Status.OK), reading(9.0, Status.SATURATED)]) == pytest.approx(np.ones(6))
     with pytest.raises(ValueError, match="no trustworthy"):
         mean_wrench([reading(9.0, Status.SATURATED)])
+
+
+@given(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5))
+def test_a_known_tool_weighs_nothing_however_the_arm_turns_after_zeroing(zeroed_at, turned_to):
+    load = FreeAirLoad(0.0, np.zeros(2), 10.0)
+    bias = np.array([0.3, -0.2, 0.01])
+    sensor = WristSensor(np.array([0.0, 0.2, 0.0]), np.zeros(3), 1.1, np.array([0.005, 0.09]), 10.0)
+
+    def reading(angle):
+        # 11 N down at the tool's centre, 110 mm below the sensor and 5 mm to its right; in the sensor's axes
+        down = 11.0 * np.array([-np.sin(angle), -np.cos(angle)])
+        return spatial(*(np.array([*down, 0.005 * down[1] + 0.11 * down[0]]) + bias))
+
+    at, to = np.array([0.1, 0.3, zeroed_at]), np.array([-0.1, 0.2, turned_to])
+    sensor = sensor.zeroed(reading(zeroed_at), at, at, np.zeros(3), load)
+    assert sensor.offset == pytest.approx(bias)
+    assert sensor.wrench_on_go(reading(turned_to), to, to[:2]) == pytest.approx(np.zeros(3), abs=1e-12)

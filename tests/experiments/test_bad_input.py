@@ -275,7 +275,8 @@ table_tags: [{id: 0, size: 0.04}]
         (
             "ideal",
             "idel",
-            "line 2: world.profile: unknown world profile 'idel'\n    expected: ideal\n    nearest:  ideal",
+            "line 2: world.profile: unknown world profile 'idel'\n    expected: one of hard, ideal, lab\n"
+            "    nearest:  ideal",
         ),
         ("world: {profile: ideal}\n", "", "line 1: world: missing key: arm, wrist, camera are simulated"),
         ("kind: arm}", "kind: amr}", "line 4: devices.arm.kind: unknown value 'amr'\n    expected: one of arm,"),
@@ -315,3 +316,45 @@ def test_the_command_exits_with_2_and_writes_nothing(folder, command, argument, 
     assert argument in shown.err
     assert "Traceback" not in shown.err
     assert sorted(folder.rglob("*")) == before
+
+
+SCENES = {
+    "fingers too soft for the object": (
+        (
+            "mine.yaml",
+            "sensor: soft_bubble",
+            "sensor: {name: a, rho_mm: 9, stiffness_printed: [[9e3, 0, 0], [0, 9e3, 0], [0, 0, 9e3]]}",
+        ),
+        "mine.yaml, line 3: sensor: the fingers are too soft: a push of ",
+        "makes the go spin out of the grasp",
+    ),
+    "no friction": (
+        ("mine.yaml", "station: sim", "station: sim\nfriction: {go-ground: 0}"),
+        "mine.yaml, line 3: friction.go-ground: the number 0",
+        "greater than 0",
+    ),
+    "extrinsic object that stands nowhere": (
+        ("mine.yaml", "station: sim", "station: sim\nextrinsic_object: hbox"),
+        "mine.yaml, line 3: extrinsic_object: missing",
+        "a pose in the world",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", list(SCENES))
+def test_a_scene_that_the_plant_would_refuse_is_refused_before_the_start(folder, case):
+    (file, old, new), first, says = SCENES[case]
+    edited(folder / file, old, new)
+    text = refusal()
+    assert text.startswith(first)
+    assert says in text
+
+
+def test_bad_input_in_a_world_profile_of_ones_own(folder):
+    (folder / "mine_profile.yaml").write_text("description: mine\narm: {repeatabilty: {angle_deg: 0.1}}\n")
+    with pytest.raises(InputError) as e:
+        load("mine.yaml", None, ["world.profile=mine_profile.yaml"])
+    [problem] = e.value.problems
+    assert (problem.file, problem.line, problem.nearest) == ("mine_profile.yaml", 2, "repeatability")
+    (folder / "mine_profile.yaml").write_text("description: mine\n")
+    assert load("mine.yaml", None, ["world.profile=mine_profile.yaml"])

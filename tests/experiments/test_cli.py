@@ -17,7 +17,7 @@ def test_every_command_has_help_with_an_example(command, name):
 def test_status_of_a_station_that_is_not_running_says_where_it_looked(command):
     finished = command.finish(command.start("status", "sim", "--set", f"bus.endpoint={command.endpoint}"))
     assert finished.code == 3
-    assert finished.out.count(f"nothing listens at {command.endpoint}") == 5
+    assert finished.out.count(f"nothing listens at {command.endpoint}") == 7
 
 
 def test_status_shows_every_device_alive_with_its_rate_in_real_time(command):
@@ -25,7 +25,7 @@ def test_status_shows_every_device_alive_with_its_rate_in_real_time(command):
     assert "serving" in host.stderr.readline()
     finished = command.finish(command.start("status", "sim", "--set", f"bus.endpoint={command.endpoint}"))
     assert finished.code == 0, finished.out + finished.err
-    for device in ("arm", "gripper", "wrist_ft", "table_ft", "camera"):
+    for device in ("arm", "gripper", "wrist_ft", "table_ft", "camera", "finger_left", "finger_right"):
         [row] = [line for line in finished.out.splitlines() if line.strip().startswith(device)]
         assert " yes " in row
     host.send_signal(signal.SIGINT)

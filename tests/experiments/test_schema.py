@@ -91,7 +91,7 @@ def test_the_camera_sees_the_table_tags_and_the_whole_grasped_object():
 
 def test_the_shipped_station_is_a_whole_one():
     station = load_station("sim")
-    assert {d.kind for d in station.devices.values()} == {"arm", "gripper", "force_torque", "tag_camera"}
+    assert {d.kind for d in station.devices.values()} == {"arm", "gripper", "force_torque", "tag_camera", "tactile"}
     assert station.devices["wrist_ft"].model_dump()["pose"] == (0.0, 0.2, 0.0)
     assert len({tag.id for tag in station.table_tags}) == 4
 

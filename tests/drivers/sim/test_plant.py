@@ -220,7 +220,11 @@ def test_go_dragged_over_the_eo_has_the_signs_of_the_convention(make_scene, dire
         plant.step((x, y - 0.012 * i / 500, angle), (0.0, -0.024, 0.0))
     for i in range(1, 501):
         plant.step((x + direction * 0.05 * i * 1e-3, y - 0.012, angle), (direction * 0.05, 0.0, 0.0))
-    (contact,) = (c for c in plant.contacts() if c.by == "go")
+    # a fast contact hops by micrometres; take a step in which it touches
+    while not (pressing := [c for c in plant.contacts() if c.by == "go"]):
+        x, y, angle = plant.ee_pose
+        plant.step((x + direction * 0.05e-3, y, angle), (direction * 0.05, 0.0, 0.0))
+    (contact,) = pressing
     assert contact.on == "eo"
     # n points down into the eo, so t is −x: a go that moves along +x moves along −t
     np.testing.assert_allclose(contact.normal, [0.0, -1.0], atol=1e-4)
@@ -318,9 +322,30 @@ def test_ee_that_is_nowhere_is_a_fault(make_scene):
             "eo and ground overlap",
         ),
         ({"grasped": Body(name="a", vertices=((0, 0), (0.1, 0), (0, 0.1)), mass=0.1)}, "must be the centroid"),
+        ({"friction": {"go-ground": 0.0}}, r"scene\.friction: 'go-ground' is 0; expected a number above 0"),
+        ({"friction": {"go-ground": 0.3, "go-eo": -0.1}}, "'go-eo' is -0.1"),
+        (
+            {
+                "extrinsic": Body(name="a", vertices=rectangle(0.1, 0.1), mass=0.1),
+                "extrinsic_pose": (0.05, 0.2, 0.0),
+            },
+            "go and eo overlap over",
+        ),
     ],
 )
 def test_scene_that_cannot_be_is_refused(make_scene, parts, message):
     scene: Scene = make_scene(**parts)
     with pytest.raises(ValueError, match=message):
         Plant(scene)
+
+
+@pytest.mark.parametrize(("margin", "stable"), [(1.01, True), (0.99, False)])
+def test_grasp_needs_the_torsional_stiffness_that_a_push_of_10_newtons_asks_for(make_scene, margin, stable):
+    """A dead load F at the distance L turns the go out of fingers softer than F L, less the pendulum of its weight."""
+    needed = 10.0 * np.hypot(0.025, 0.07345 + 0.045) - 0.1 * 9.81 * 0.045
+    diagonal = ((2000.0, 0.0, 0.0), (0.0, 2000.0, 0.0), (0.0, 0.0, margin * needed))
+    if stable:
+        Plant(make_scene(stiffness=diagonal))
+        return
+    with pytest.raises(ValueError, match=r"scene\.stiffness: .* makes the go spin out of the grasp"):
+        Plant(make_scene(stiffness=diagonal))

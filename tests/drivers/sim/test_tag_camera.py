@@ -7,6 +7,8 @@ import pytest
 from drivers.config import TagCameraConfig
 from drivers.errors import NotConnected
 from drivers.scene import TagMount
+from drivers.sim.mismatch import CameraFigures, Mismatch
+from drivers.sim.screen import Screen
 from drivers.sim.tag_camera import SimTagCamera, TagRenderer
 from drivers.tags import TagDetector, tag_bitmap
 from mechanics.camera import CameraModel, tag_corners
@@ -131,11 +133,14 @@ def test_a_tag_behind_the_camera_is_not_seen() -> None:
 
 
 class FakeWorld:
-    """A clock and a set of tags."""
+    """A clock, a profile, a set of tags, and what stands in front of them."""
 
     lockstep = True
 
-    def __init__(self) -> None:
+    def __init__(self, **figures) -> None:
+        self.profile = Mismatch(camera=CameraFigures(**figures))
+        self.fingers: list[Screen] = []
+        self.twists: dict[int, np.ndarray] = {}
         self.tags: list[tuple[TagMount, np.ndarray]] = [
             (TagMount(id=i, size=0.04, pose=(x, -0.04, 0.0)), ORIGIN) for i, x in enumerate((-0.15, -0.05, 0.05, 0.15))
         ]
@@ -146,6 +151,12 @@ class FakeWorld:
 
     def visible_tags(self) -> list[tuple[TagMount, np.ndarray]]:
         return self.tags
+
+    def tag_twists(self) -> dict[int, np.ndarray]:
+        return self.twists
+
+    def screens(self) -> list[Screen]:
+        return self.fingers
 
 
 CONFIG = TagCameraConfig.model_validate(
@@ -207,7 +218,8 @@ def test_noise_comes_from_the_generator_given() -> None:
     pictures = []
     for seed in (1, 1, 2):
         config = CONFIG.model_copy(update={"width": 320, "height": 240})
-        with SimTagCamera("camera", config, FakeWorld(), noise=4.0, rng=np.random.default_rng(seed)) as camera:
+        with SimTagCamera("camera", config, FakeWorld(noise=4.0)) as camera:
+            camera.restart(np.random.default_rng(seed))
             camera.capture()
             picture = camera.image()
         assert picture is not None

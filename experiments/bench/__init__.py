@@ -1,0 +1,49 @@
+"""Benchmarks: figures of one run side by side, and the targets they are held against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from rich.console import Console
+
+from experiments.bench import figures
+from experiments.exit_codes import ExitCode
+from experiments.progress import Progress
+from experiments.run_folder import write_json
+from mechanics.yaml_input import InputError, Problem, nearest, one_of
+
+
+def _sim(runs: int) -> Iterator[figures.Figure]:
+    from experiments.bench import sim
+
+    return sim.run(runs)
+
+
+BENCHMARKS: dict[str, Callable[[int], Iterator[figures.Figure]]] = {"sim": _sim}
+
+
+def main(name: str, runs: int, json_file: Path | None, out: Path | None, check: bool) -> ExitCode:
+    """Run a benchmark and show it; the exit code says whether every target holds, if that was asked.
+
+    Raises InputError for a benchmark that does not exist.
+    """
+    if name not in BENCHMARKS:
+        known = one_of(BENCHMARKS)
+        raise InputError([Problem("bench", None, name, "there is no such benchmark", known, nearest(name, BENCHMARKS))])
+    targets = figures.targets_of(name)
+    said = Console(stderr=True)
+    measured: list[figures.Figure] = []
+    with Progress(said).step(f"bench {name}"):
+        for figure in BENCHMARKS[name](runs):
+            measured.append(figure)
+            said.print(f"{figure.name}: {figure.median:.3g} {figure.unit}", highlight=False, markup=False)
+    Console().print(figures.table(f"bench {name}", measured, targets))
+    for path in (json_file, None if out is None else out / f"{name}.json"):
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_json(path, figures.as_json(name, measured, targets))
+    short = figures.shortfalls(measured, targets) if check else []
+    for line in short:
+        said.print(f"short: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
+    return ExitCode.FELL_SHORT if short else ExitCode.DONE

@@ -1,0 +1,440 @@
+"""What goes wrong with a device shows as the error or the status that the interface promises, on every backend."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from drivers.config import BusConfig, ForceTorqueConfig, GripperConfig, StationConfig, WorldConfig
+from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, NotConnected, ProtocolError
+from drivers.fault import Fault
+from drivers.interfaces import ArmTarget
+from drivers.sim.world import World
+from drivers.station import Station
+from mechanics.readings import Status
+
+NAMES = {"arm": "arm", "gripper": "gripper", "force_torque": "wrist_ft", "tag_camera": "camera"}
+STREAMS = ("arm", "gripper", "force_torque")
+
+
+def befalls(fault: str, *kinds: str):
+    """A claim about a fault and each of the kinds of device that it befalls."""
+    return pytest.mark.parametrize(("fault", "kind"), [(fault, kind) for kind in kinds])
+
+
+@pytest.fixture(autouse=True)
+def mended(request):
+    """Leave every device as the next claim expects it."""
+    if "lab" not in request.fixturenames:
+        yield
+        return
+    lab = request.getfixturevalue("lab")
+    yield
+    lab.simulation.clear_faults()
+    for device in lab.devices.values():
+        device.close()
+        device.connect()
+
+
+def inject(lab, fault, kind, **figures):
+    lab.simulation.inject({"kind": fault, "device": NAMES[kind], **figures})
+
+
+def read(device):
+    """The way to a reading: the stream's newest, or a frame on request."""
+    return getattr(device, "capture", device.latest)()
+
+
+def move(arm, x):
+    arm.command(ArmTarget(np.array([x, 0.25, 0.1]), np.zeros(3), 0.5))
+
+
+def statuses(device, since_ns):
+    return {reading.stamp.status for reading in device.since(since_ns)}
+
+
+# -- drop --------------------------------------------------------------------------------------------------------------
+
+
+@befalls("drop", *STREAMS)
+def test_dropped_readings_are_counted_exactly(lab, fault, kind):
+    device = lab.devices[NAMES[kind]]
+    lab.clock.sleep(0.3)
+    inject(lab, fault, kind, value=0.3)
+    lab.clock.sleep(1.0)
+    lab.simulation.clear_faults()
+    lab.clock.sleep(0.2)
+    sequences = [reading.stamp.sequence for reading in device.since(0)]
+    missing = set(range(sequences[0], sequences[-1])) - set(sequences)
+    assert device.gaps == len(missing)
+    # 0.3 of the second's readings, within four sigma of the binomial
+    expected = device.describe().rate * 0.3
+    assert len(missing) == pytest.approx(expected, abs=4 * np.sqrt(expected * 0.7))
+
+
+@befalls("drop", "force_torque")
+def test_the_same_readings_are_dropped_for_the_same_seed(lab, fault, kind, scene):
+    def kept():
+        lab.simulation.reset(7, scene)
+        inject(lab, fault, kind, value=0.5)
+        lab.clock.sleep(0.2)
+        return [reading.stamp.sequence for reading in lab.devices["wrist_ft"].since(0)]
+
+    first = kept()
+    assert kept() == first
+    assert 0 < len(first) < 199
+
+
+@befalls("drop", "tag_camera")
+def test_a_dropped_frame_is_a_timeout_and_a_gap(lab, fault, kind):
+    camera = lab.devices["camera"]
+    lab.clock.sleep(0.1)
+    first = camera.capture().stamp.sequence
+    inject(lab, fault, kind, value=1.0)
+    with pytest.raises(DeviceTimeout) as caught:
+        camera.capture()
+    assert caught.value.device == "camera"
+    lab.simulation.clear_faults()
+    assert camera.capture().stamp.sequence == first + 2
+    assert camera.gaps == 1
+
+
+# -- freeze ------------------------------------------------------------------------------------------------------------
+
+
+@befalls("freeze", *NAMES)
+def test_a_silent_device_gives_no_old_reading_as_new(lab, fault, kind):
+    device = lab.devices[NAMES[kind]]
+    lab.clock.sleep(0.5)
+    read(device)
+    inject(lab, fault, kind)
+    lab.clock.sleep(0.3)
+    with pytest.raises(DeviceTimeout) as caught:
+        read(device)
+    assert caught.value.device == NAMES[kind]
+    lab.simulation.clear_faults()
+    lab.clock.sleep(0.1)
+    assert lab.clock.now_ns() - read(device).stamp.capture_ns <= 5e7
+    assert device.gaps == 0
+
+
+@befalls("freeze", *STREAMS)
+def test_a_reading_may_be_as_old_as_its_max_age(lab, fault, kind):
+    device = lab.devices[NAMES[kind]]
+    lab.clock.sleep(0.5)
+    newest = device.latest().stamp
+    inject(lab, fault, kind)
+    assert device.max_age == max(5 / device.describe().rate, 0.1)
+    lab.clock.sleep(device.max_age - 0.05)
+    assert device.latest().stamp == newest
+    assert device.latest().stamp == newest  # a clock that stands still ages nothing
+    lab.clock.sleep(0.06)
+    with pytest.raises(DeviceTimeout):
+        device.latest()
+
+
+@befalls("freeze", "arm", "gripper", "force_torque")
+def test_commands_to_a_silent_device_time_out(lab, fault, kind):
+    lab.clock.sleep(0.1)
+    arm = lab.devices["arm"]
+    arm.acquire("test")
+    inject(lab, fault, kind)
+    commands = {
+        "arm": lambda: move(arm, 0.02),
+        "gripper": lambda: lab.devices["gripper"].grasp(10.0),
+        "force_torque": lab.devices["wrist_ft"].tare,
+    }
+    with pytest.raises(DeviceTimeout) as caught:
+        commands[kind]()
+    assert caught.value.device == NAMES[kind]
+    lab.simulation.clear_faults()
+    arm.release()
+
+
+@befalls("freeze", "arm")
+def test_an_arm_that_falls_silent_rests(lab, fault, kind):
+    arm = lab.devices["arm"]
+    lab.clock.sleep(0.1)
+    with arm.lease("test"):
+        move(arm, 0.02)
+        lab.clock.sleep(0.25)
+        inject(lab, fault, kind)
+        lab.clock.sleep(0.6)
+        lab.simulation.clear_faults()
+        lab.clock.sleep(0.05)
+        assert 0.005 < arm.latest().pose[0] < 0.015
+
+
+# -- stuck -------------------------------------------------------------------------------------------------------------
+
+
+@befalls("stuck", "force_torque")
+def test_a_stuck_value_is_stale_where_noise_would_move_it(lab, fault, kind, scene):
+    become(lab, scene, "lab")
+    lab.clock.sleep(0.3)
+    assert statuses(lab.devices["wrist_ft"], 0) == {Status.OK}
+    inject(lab, fault, kind)
+    lab.clock.sleep(0.3)
+    newest = lab.devices["wrist_ft"].latest()
+    assert newest.stamp.status is Status.STALE
+    assert lab.clock.now_ns() - newest.stamp.capture_ns < 2e7  # stamps advance
+    lab.simulation.clear_faults()
+    lab.clock.sleep(0.1)
+    assert lab.devices["wrist_ft"].latest().stamp.status is Status.OK
+    become(lab, scene, "ideal")
+
+
+def become(lab, scene, profile):
+    world = WorldConfig(profile=profile)
+    if isinstance(lab.simulation, World):
+        lab.simulation.reset(0, scene, world)
+    else:
+        lab.simulation.reset(0, scene, world.model_dump())
+
+
+@befalls("stuck", "arm")
+def test_a_stuck_pose_is_stale_once_the_arm_should_have_moved(lab, fault, kind):
+    arm = lab.devices["arm"]
+    lab.clock.sleep(0.1)
+    with arm.lease("test"):
+        inject(lab, fault, kind)
+        lab.clock.sleep(0.1)
+        assert arm.latest().stamp.status is Status.OK  # at rest the stuck pose is the true one
+        move(arm, 0.02)
+        lab.clock.sleep(0.6)
+        assert arm.latest().stamp.status is Status.STALE
+        lab.simulation.clear_faults()
+        lab.clock.sleep(0.1)
+        assert arm.latest().stamp.status is Status.OK
+        np.testing.assert_allclose(arm.latest().pose, [0.02, 0.25, 0.1], atol=1e-6)
+
+
+@befalls("stuck", "gripper")
+def test_a_stuck_gripper_is_stale_once_it_was_told_to_open(lab, fault, kind):
+    gripper = lab.devices["gripper"]
+    lab.clock.sleep(0.2)
+    inject(lab, fault, kind)
+    lab.clock.sleep(0.1)
+    gripper.release()
+    lab.clock.sleep(0.6)
+    assert gripper.latest().stamp.status is Status.STALE
+
+
+# -- delay -------------------------------------------------------------------------------------------------------------
+
+
+@befalls("delay", *STREAMS)
+def test_a_delay_shows_in_the_age_and_keeps_order(lab, fault, kind):
+    device = lab.devices[NAMES[kind]]
+    lab.clock.sleep(0.5)
+    inject(lab, fault, kind, value=0.06)
+    lab.clock.sleep(0.5)
+    age = (lab.clock.now_ns() - device.latest().stamp.capture_ns) * 1e-9
+    assert 0.06 <= age < 0.06 + 1 / device.describe().rate
+    lab.simulation.clear_faults()
+    lab.clock.sleep(0.3)
+    stamps = [reading.stamp for reading in device.since(0)]
+    assert np.all(np.diff([stamp.sequence for stamp in stamps]) == 1)
+    assert np.all(np.diff([stamp.capture_ns for stamp in stamps]) > 0)
+    assert device.gaps == 0
+
+
+@befalls("delay", *NAMES)
+def test_a_delay_beyond_what_is_bearable_is_a_timeout(lab, fault, kind):
+    device = lab.devices[NAMES[kind]]
+    lab.clock.sleep(0.5)
+    inject(lab, fault, kind, value=3.0)
+    lab.clock.sleep(0.5)
+    with pytest.raises(DeviceTimeout) as caught:
+        read(device)
+    assert caught.value.device == NAMES[kind]
+
+
+# -- bias --------------------------------------------------------------------------------------------------------------
+
+
+@befalls("bias", "arm", "gripper", "force_torque")
+def test_a_jump_is_invalid_until_it_is_taken_back(lab, fault, kind):
+    device = lab.devices[NAMES[kind]]
+    lab.clock.sleep(0.5)
+    before = lab.clock.now_ns()
+    assert statuses(device, 0) == {Status.OK}
+    inject(lab, fault, kind, value={"arm": 0.05, "gripper": 0.02, "force_torque": 0.5}[kind])
+    lab.clock.sleep(1.0)
+    assert statuses(device, before) == {Status.INVALID}
+    lab.simulation.clear_faults()
+    after = lab.clock.now_ns()
+    lab.clock.sleep(0.2)
+    assert statuses(device, after) == {Status.OK}
+
+
+# -- saturate ----------------------------------------------------------------------------------------------------------
+
+
+@befalls("saturate", "force_torque")
+def test_a_saturated_reading_is_clipped_and_says_so(lab, fault, kind):
+    wrist = lab.devices["wrist_ft"]
+    lab.clock.sleep(0.2)
+    assert np.abs(wrist.latest().wrench).max() == pytest.approx(0.981, rel=0.02)  # the weight of 100 g
+    inject(lab, fault, kind, value=0.4)
+    lab.clock.sleep(0.1)
+    assert wrist.latest().stamp.status is Status.SATURATED
+    assert np.abs(wrist.latest().wrench).max() == 0.4
+
+
+# -- garbage -----------------------------------------------------------------------------------------------------------
+
+
+@befalls("garbage", *STREAMS)
+def test_garbage_is_a_protocol_error_counted_and_survived(lab, fault, kind):
+    device = lab.devices[NAMES[kind]]
+    lab.clock.sleep(0.5)
+    good = len(device.since(0))
+    inject(lab, fault, kind)
+    lab.clock.sleep(0.5)
+    with pytest.raises(ProtocolError) as caught:
+        device.latest()
+    assert caught.value.device == NAMES[kind]
+    assert device.corrupt == pytest.approx(device.describe().rate * 0.5, abs=1)
+    assert len(device.since(0)) == good
+    lab.simulation.clear_faults()
+    lab.clock.sleep(0.1)
+    assert device.latest().stamp.status is Status.OK
+    assert device.gaps == 0
+
+
+@befalls("garbage", "tag_camera")
+def test_a_garbled_frame_is_a_protocol_error_and_the_next_is_whole(lab, fault, kind):
+    camera = lab.devices["camera"]
+    lab.clock.sleep(0.1)
+    inject(lab, fault, kind)
+    with pytest.raises(ProtocolError) as caught:
+        camera.capture()
+    assert caught.value.device == "camera"
+    assert camera.corrupt == 1
+    lab.simulation.clear_faults()
+    assert [tag.id for tag in camera.capture().detections] == [3]
+
+
+# -- disconnect --------------------------------------------------------------------------------------------------------
+
+
+@befalls("disconnect", *NAMES)
+def test_a_device_that_goes_is_a_fault_until_it_is_connected_again(lab, fault, kind):
+    device = lab.devices[NAMES[kind]]
+    lab.clock.sleep(0.3)
+    inject(lab, fault, kind, duration=0.5)
+    wait_until_gone(device)
+    for use in (lambda: read(device), lambda: device.since(0)):
+        with pytest.raises(DeviceFault) as caught:
+            use()
+        assert caught.value.device == NAMES[kind]
+    device.close()
+    with pytest.raises(NotConnected):
+        device.connect(timeout=0.2)
+    lab.clock.sleep(0.6)
+    device.connect()
+    lab.clock.sleep(0.3)
+    assert lab.clock.now_ns() - read(device).stamp.capture_ns <= 5e7
+
+
+def wait_until_gone(device, within=2.0):
+    deadline = time.monotonic() + within
+    while time.monotonic() < deadline:
+        try:
+            device.since(0)
+        except DeviceFault:
+            return
+    raise AssertionError(f"{device.name} is still there after {within} s")
+
+
+@befalls("disconnect", "arm")
+def test_commands_to_an_arm_that_has_gone_are_faults_and_it_rests(lab, fault, kind):
+    arm = lab.devices["arm"]
+    lab.clock.sleep(0.1)
+    arm.acquire("test")
+    move(arm, 0.02)
+    lab.clock.sleep(0.25)
+    inject(lab, fault, kind, duration=0.5)
+    wait_until_gone(arm)
+    with pytest.raises(DeviceFault) as caught:
+        move(arm, 0.02)
+    assert caught.value.device == "arm"
+    arm.close()
+    lab.clock.sleep(1.0)
+    arm.connect()
+    lab.clock.sleep(0.1)
+    assert 0.005 < arm.latest().pose[0] < 0.015
+    with arm.lease("test"):
+        move(arm, 0.0)
+
+
+# -- crash -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fault", ["crash"])
+def test_after_a_crash_every_device_is_a_fault_within_two_seconds(backend, fault, endpoint, scene):
+    with backend(station(endpoint)) as own:
+        own.simulation.reset(0, scene)
+        own.clock.sleep(0.2)
+        own.simulation.inject({"kind": fault})
+        begin = time.monotonic()
+        for device in own.devices.values():
+            wait_until_gone(device)
+        with pytest.raises(DeviceFault):
+            own.clock.sleep(0.1)
+        assert time.monotonic() - begin < 2.0
+
+
+def station(endpoint, **world) -> StationConfig:
+    return StationConfig(
+        name="bench",
+        world=WorldConfig(**world),
+        bus=BusConfig(endpoint=endpoint),
+        devices={
+            "wrist_ft": ForceTorqueConfig(kind="force_torque", mount="wrist"),
+            "gripper": GripperConfig(kind="gripper"),
+        },
+    )
+
+
+# -- in real time, and by the station file -----------------------------------------------------------------------------
+
+
+def test_in_real_time_a_device_that_fell_silent_is_a_timeout(endpoint, scene):
+    faults = (Fault(kind="freeze", device="wrist_ft", after=0.3),)
+    with Station(station(endpoint, clock="realtime", faults=faults)).connect() as devices:
+        assert devices.simulation is not None
+        wrist = devices.force_torque("wrist")
+        devices.simulation.reset(0, scene)
+        wrist.latest()
+        devices.clock.sleep(0.5)
+        with pytest.raises(DeviceTimeout, match="wrist_ft"):
+            wrist.latest(timeout=0.2)
+        assert devices.gripper.latest().stamp.status is Status.OK
+        devices.simulation.clear_faults()
+        wrist.latest()
+
+
+@befalls("drop", "force_torque")
+def test_a_reset_ends_what_was_injected(lab, fault, kind, scene):
+    inject(lab, fault, kind, value=1.0)
+    lab.simulation.reset(0, scene)
+    lab.clock.sleep(0.1)
+    assert len(lab.devices["wrist_ft"].since(0)) == 100
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"kind": "freeze", "device": "wirst_ft"}, "wrist_ft"),
+        ({"kind": "freese", "device": "arm"}, "freeze"),
+        ({"kind": "drop", "device": "arm"}, "share of readings"),
+        ({"kind": "bias", "device": "camera", "value": 1.0}, "means nothing"),
+    ],
+)
+def test_a_fault_that_cannot_be_is_refused(lab, wrong, says):
+    with pytest.raises(CommandRefused, match=says):
+        lab.simulation.inject(wrong)
