@@ -2,6 +2,7 @@
 
 import pytest
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 #: the paper's Table 1, open loop: mean wrench error [N] and pose error [mm]
@@ -21,7 +22,7 @@ def test_open_loop_in_the_lab_is_at_least_as_bad_as_the_papers(command, experime
     run = command.finish(process, timeout=900)
     assert run.code == 0, run.err
     wrench, pose = mean(run.results, "wrench_N"), mean(run.results, "go_pose_mm")
-    row = Table("open loop, measured", "wrench [N]", "pose [mm]")
+    row = Table("open loop, measured", escape("wrench [N]"), escape("pose [mm]"))
     row.add_row(f"{experiment}, lab", f"{wrench:.2f}", f"{pose:.2f}")
     row.add_row("paper", *(f"{figure:.2f}" for figure in PAPER[experiment]))
     with capsys.disabled():
