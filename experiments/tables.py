@@ -42,7 +42,7 @@ def error_table(results: dict[str, Any]) -> Table:
             completed = sum(trial["status"] == "completed" for trial in group)
             _rows(table, f"{skill}, {controller}", f"{completed} of {len(group)}", group, "bold")
         if printed is not None:
-            name = f"{skill}, {controller}" if len(group) == 1 else ""
+            name = controller if len(group) == 1 else ""
             table.add_row(name, "", "paper", *(_cell(printed[key]) for key in FIGURES), style="dim")
     return table
 
