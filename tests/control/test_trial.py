@@ -122,10 +122,10 @@ def test_the_wrist_bias_is_taken_out_and_the_weight_is_not():
 def test_a_grasp_far_from_the_plan_is_not_started():
     station = Station("grasp.centre_mm=[0, 45]")
     observer = station.observer()
-    observer.tags["go"] = tuple(replace(tag, pose=(tag.pose[0] + 0.012, *tag.pose[1:])) for tag in observer.tags["go"])
+    observer.tags["go"] = tuple(replace(tag, pose=(tag.pose[0] + 0.008, *tag.pose[1:])) for tag in observer.tags["go"])
     result = station.run(observer=observer)
     assert result.status == "stopped"
-    assert "12.0 mm" in result.reason and "tolerance 10 mm" in result.reason
+    assert "8.0 mm" in result.reason and "tolerance 5 mm" in result.reason
     assert station.waypoints == []
 
 
