@@ -377,6 +377,21 @@ class Simulation(Protocol):
         """
         ...
 
+    def rearrange(self, scene: dict) -> None:
+        """Another `drivers.scene.Scene` on the same table while time runs on, as when a person changes the object.
+
+        The arm stays where it is (the scene's start is not looked at), the new object hangs in the fingers, nothing
+        is clamped; sensors, seed and lab stay. Raises CommandRefused, and changes nothing, for one that cannot be.
+        """
+        ...
+
+    def clamp(self, body: str | None) -> None:
+        """Fix ``go`` or ``eo`` to the environment where it is now; None frees whatever was fixed.
+
+        Raises CommandRefused for a body that is not here.
+        """
+        ...
+
     def inject(self, fault: Fault | dict) -> None:
         """Let a fault happen; its times count from now. A reset or `clear_faults` ends it.
 

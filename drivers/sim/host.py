@@ -127,6 +127,8 @@ class Host:
                 ("reset", self._reset),
                 ("advance", self._advance),
                 ("regrasp", self._regrasp),
+                ("rearrange", self._rearrange),
+                ("clamp", self._clamp),
                 ("truth", self._truth),
                 ("inject", self._inject),
                 ("clear_faults", self._clear_faults),
@@ -242,6 +244,16 @@ class Host:
 
     def _regrasp(self, payload: bytes) -> None:
         self.world.regrasp(messages.decode(payload, messages.INTEGER).data)
+
+    def _rearrange(self, payload: bytes) -> None:
+        try:
+            scene = json.loads(messages.decode(payload, messages.STRING).data)
+        except ValueError as error:
+            raise CommandRefused(topics.WORLD, "rearrange", str(error), "Send a scene as JSON") from error
+        self.world.rearrange(scene)
+
+    def _clamp(self, payload: bytes) -> None:
+        self.world.clamp(messages.decode(payload, messages.STRING).data or None)
 
     def _inject(self, payload: bytes) -> None:
         try:

@@ -24,6 +24,8 @@ SLIP_SPEED = 1e-4
 SAME_POINT = 1e-4
 #: beyond these the state is nonsense: metres or radians, and their rates
 FARTHEST, FASTEST = 20.0, 200.0
+#: inertia of a degree of freedom that is clamped [kg, kg·m²]: nothing moves it within a step
+IMMOVABLE = 1e9
 #: the largest product of the go's fastest natural frequency and the step that the explicit coupling may see
 RESOLVED = 0.45
 
@@ -85,6 +87,7 @@ class Plant:
         self.coupling = self._coupling_at(self.scene.grasp)
         self._slipped = self._turned = 0.0
         self.held = True
+        self.clamp(None)
         self.steps = 0
         self._fault: SimulationDiverged | None = None
         #: how often the number of contact points has changed: a contact that flickers at rest is a sick one
@@ -126,6 +129,9 @@ class Plant:
         self._apply()
         self._state_of_forces = self._state
         mujoco.mj_step(self.model, self.data)
+        if self._clamped is not None:
+            clamped, at = self._clamped
+            self._qpos[clamped], self._qvel[clamped] = at, 0.0
         self._ee, self._ee_twist = ee, ee_twist
         self._observe(self._substep)
         if self.data.ncon != self._contact_points:
@@ -225,6 +231,22 @@ class Plant:
         self._slipped += coupling.slipped
         self._turned += coupling.turned
 
+    def clamp(self, body: str | None) -> None:
+        """Fix ``body`` (``go`` or ``eo``) to the environment where it is, and whatever was fixed no more.
+
+        Raises CommandRefused, and changes nothing, for a body that is not here.
+        """
+        if body is not None and not (body == "go" or (body == "eo" and self._has_eo)):
+            raise CommandRefused("world", "clamp", f"there is no body '{body}'", "Clamp go, or eo where there is one")
+        self.model.dof_armature[:] = 0.0
+        self._clamped: tuple[slice, Array] | None = None
+        if body is not None:
+            first = 0 if body == "go" else 3
+            dofs = slice(first, first + 3)
+            self.model.dof_armature[dofs] = IMMOVABLE
+            self._qvel[dofs] = 0.0
+            self._clamped = dofs, self._qpos[dofs].copy()
+
     def _touching(self) -> list[list[str]]:
         """The pairs of bodies that touch or overlap, sorted by name."""
         contacts = (self.data.contact[i] for i in range(self.data.ncon))
@@ -275,7 +297,24 @@ class Plant:
             gx, gy = r[3], r[4]
             tau += r[5] + (q[3] - x) * gy - (q[4] - y) * gx
             fx, fy = fx + gx, fy + gy
+        if self._clamped is not None:
+            cx, cy, ct = self._clamp_load(x, y)
+            fx, fy, tau = fx - cx, fy - cy, tau - ct
         return -fx, -fy, -tau
+
+    def _clamp_load(self, x: float, y: float) -> tuple[float, float, float]:
+        """What the clamped body hands on to the table top that it is fixed to, about (x, y) in W, axes of W."""
+        assert self._clamped is not None
+        dofs, q = self._clamped[0], self._state_of_forces
+        fx, fy, tau = self._reaction[dofs].tolist()
+        first = dofs.start
+        if first == 0:
+            gx, gy, gt = self._applied[:3].tolist()
+            fx, fy, tau = fx + gx, fy + gy, tau + gt
+        body = self.scene.grasped if first == 0 else self.scene.extrinsic
+        assert body is not None
+        fy -= body.mass * self.scene.gravity
+        return fx, fy, tau + (q[first] - x) * fy - (q[first + 1] - y) * fx
 
     def ground_wrench(self, p_W: ArrayLike = (0.0, 0.0)) -> Array:
         """Total wrench (3,) of the go and the eo on the table about ``p_W`` (2,) in W, axes of W."""

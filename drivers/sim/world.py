@@ -177,14 +177,7 @@ class World:
             self._set_world(world)
         self.lab = Lab(self.profile, seed)
         try:
-            fingers = self.profile.fingers
-            plant = Plant(
-                self._actual(scene),
-                self._stiffness_scale,
-                self._timestep,
-                self.profile.membrane,
-                (fingers.force_limit or inf, fingers.torque_limit or inf),
-            )
+            plant = self._plant_of(scene)
         except (ValueError, DeviceFault):
             self.profile, self._stiffness_scale, self._faults, self.lab = before
             raise
@@ -201,12 +194,24 @@ class World:
             self._arm.place(scene.start)
         self.faults.restart(self._faults, seed, self.now_ns())
 
+    def _plant_of(self, scene: Scene) -> Plant:
+        fingers = self.profile.fingers
+        limit = fingers.force_limit or inf, fingers.torque_limit or inf
+        return Plant(self._actual(scene), self._stiffness_scale, self._timestep, self.profile.membrane, limit)
+
     def _actual(self, scene: Scene) -> Scene:
         """The scene as it truly is in this lab."""
         start = tuple(a + b for a, b in zip(scene.start, self.lab.arm_bias, strict=True))
         stiffness = tuple(tuple(row) for row in self.lab.stiffness(scene.stiffness).tolist())
-        changed = {"start": start, "stiffness": stiffness, "friction": self.lab.friction(scene.friction)}
+        changed = {"start": start, "stiffness": stiffness, "friction": self._true_friction(scene)}
         return scene.model_copy(update=changed)
+
+    def _true_friction(self, scene: Scene) -> dict[str, float]:
+        """The coefficients of this lab. A body keeps its own by its name, whichever role it has: an eo that is held."""
+        held, met = scene.grasped.name, "eo" if scene.extrinsic is None else scene.extrinsic.name
+        of_pair = {"go-ground": f"{held}-ground", "go-eo": f"{held}-{met}", "eo-ground": f"{met}-ground"}
+        true = self.lab.friction({of_pair.get(pair, pair): mu for pair, mu in scene.friction.items()})
+        return {pair: true[of_pair.get(pair, pair)] for pair in scene.friction}
 
     def regrasp(self, trial: int) -> None:
         """Take the go into the fingers anew, as between trials, and draw what no calibration removes.
@@ -224,6 +229,22 @@ class World:
         offset, fresh = self.lab.grasp_offset(trial), not plant.membrane.is_linear or min(plant.finger_limit) < inf
         if plant.held and (fresh or offset.any()):
             plant.regrasp(se2.compose(np.array(self.scene.grasp), offset), self.lab.membrane_strain(trial))
+
+    def rearrange(self, scene: Scene | dict) -> None:
+        """As `Simulation.rearrange`. Raises CommandRefused, and changes nothing, for a scene that cannot be."""
+        before = self.plant("world", "rearrange")
+        try:
+            scene = scene if isinstance(scene, Scene) else Scene.model_validate(scene)
+            believed = tuple(a - b for a, b in zip(before.ee_pose, self.lab.arm_bias, strict=True))
+            scene = scene.model_copy(update={"start": believed})
+            self._plant = self._plant_of(scene)
+        except ValueError as error:
+            raise CommandRefused("world", "rearrange", str(error), "Correct the scene, or lift the arm") from error
+        self.scene = scene
+
+    def clamp(self, body: str | None) -> None:
+        """As `Simulation.clamp`."""
+        self.plant("world", "clamp").clamp(body)
 
     def truth(self) -> TruthReading:
         """The plant's own state at this instant; its sequence number is that of the plant step."""

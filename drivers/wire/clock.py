@@ -10,10 +10,10 @@ from typing import Any, cast
 from drivers.errors import DeviceFault
 from drivers.fault import Fault
 from drivers.wire import messages, topics
-from drivers.wire.bus import Watch
 from drivers.wire.client import RemoteSensor
 from drivers.wire.codec import decode_reading
 from drivers.wire.link import Link
+from drivers.wire.watch import Watch
 from mechanics.readings import TruthReading
 
 _PIECE_NS = 250_000_000  # station time per request: a long sleep stays interruptible, and each reply comes in time
@@ -79,6 +79,14 @@ class RemoteSimulation:
         """As `Simulation.regrasp`. Raises DeviceFault while there is no scene, CommandRefused where it cannot be."""
         payload = messages.encode(messages.message(messages.INTEGER, data=trial))
         self._link.ask(topics.WORLD, "regrasp", payload, watch=self._watch)
+
+    def rearrange(self, scene: dict) -> None:
+        """As `Simulation.rearrange`."""
+        self._tell("rearrange", json.dumps(scene))
+
+    def clamp(self, body: str | None) -> None:
+        """As `Simulation.clamp`."""
+        self._tell("clamp", body or "")
 
     def inject(self, fault: Fault | dict) -> None:
         """As `Simulation.inject`. A crash takes the host with it before it could answer."""
