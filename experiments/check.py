@@ -7,19 +7,25 @@ from math import inf
 from drivers.config import ForceTorqueConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
+from experiments.calibrate.schema import FrictionStage
+from experiments.calibrate.store import Calibrations, load
 from experiments.files import Resolved
-from experiments.schema import PlanStage
-from experiments.setup import scene, task
+from experiments.schema import ExecuteStage, PlanStage
+from experiments.setup import Believed, believed, scene, task
 from mechanics.yaml_input import InputError, Problem
 from planning.task import Task
 
 
-def check(resolved: Resolved) -> list[str]:
-    """What would run, in lines for a person. Raises InputError, and InfeasiblePlan where a task says so itself."""
+def check(resolved: Resolved, calibrations: Calibrations | None = None) -> list[str]:
+    """What would run, in lines for a person. Raises InputError, and InfeasiblePlan where a task says so itself.
+
+    ``calibrations`` are those that the run uses, by default what `experiments.calibrate.store.load` finds.
+    """
+    calibrations = load(resolved) if calibrations is None else calibrations
     problems = _device_problems(resolved) + _scene_problems(resolved)
     if problems:
         raise InputError(problems)
-    made = tasks(resolved)
+    made = tasks(resolved, believed(resolved, calibrations))
     experiment, station = resolved.experiment, resolved.station
     held = resolved.grasped
     lines = [
@@ -33,20 +39,24 @@ def check(resolved: Resolved) -> list[str]:
             else ""
         ),
         "friction " + ", ".join(f"{pair} {mu:g}" for pair, mu in resolved.friction.items()),
+        "calibration " + (", ".join(str(file) for file in calibrations.files.values()) or "none: nominal figures"),
     ]
     trials = 0
     for number, stage in enumerate(experiment.stages, 1):
         if isinstance(stage, PlanStage):
             lines.append(f"stage {number}: plan {stage.name}: {stage.skill}, {len(made[stage.name].go)} steps")
-        else:
+        elif isinstance(stage, ExecuteStage):
             trials += stage.trials * len(stage.controllers)
             count = f"{stage.trials} trial{'s' if stage.trials > 1 else ''} each"
             lines.append(f"stage {number}: execute {stage.plan}: {', '.join(stage.controllers)}, {count}")
+        else:
+            pair = f" of {stage.pair}" if isinstance(stage, FrictionStage) else ""
+            lines.append(f"stage {number}: {stage.stage.replace('_', ' ')}{pair}")
     lines.append(f"{trials} trial{'' if trials == 1 else 's'} in all; nothing was started")
     return lines
 
 
-def tasks(resolved: Resolved) -> dict[str, Task]:
+def tasks(resolved: Resolved, known: Believed) -> dict[str, Task]:
     """The planning task of each plan stage by name.
 
     Raises InputError at the parameter that the geometry does not allow.
@@ -56,7 +66,7 @@ def tasks(resolved: Resolved) -> dict[str, Task]:
         if not isinstance(stage, PlanStage):
             continue
         try:
-            made[stage.name] = task(resolved, stage)
+            made[stage.name] = task(resolved, stage, known)
         except ValueError as e:
             raise InputError([_task_problem(resolved, i, stage, str(e))]) from None
     return made

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Callable
-from contextlib import ExitStack
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from control.settings import TrialSettings
 from drivers.station import Devices, Station
 from drivers.wire.log import LogWriter
 from experiments import setup
+from experiments.calibrate import store
+from experiments.calibrate.models import Calibration
+from experiments.calibrate.store import Calibrations
 from experiments.files import Resolved
 from experiments.progress import Progress
 from experiments.run_folder import RunFolder, write_json
@@ -31,6 +35,7 @@ class RunContext:
     def __init__(
         self,
         resolved: Resolved,
+        calibrations: Calibrations,
         folder: RunFolder,
         results: dict[str, Any],
         log: LogWriter,
@@ -43,6 +48,7 @@ class RunContext:
         self.folder, self.results, self.log, self.progress = folder, results, log, progress
         self.settings: TrialSettings = resolved.experiment.trial
         self.plans: dict[str, Plan] = {}
+        self.calibrations = calibrations
         self.holder = f"run-{socket.gethostname()}-{os.getpid()}"
         self.ask, self.check_interrupt = ask, check_interrupt
         self._closing = closing
@@ -64,6 +70,30 @@ class RunContext:
                 devices.clock.sleep(WARM_UP)
             self._devices = devices
         return self._devices
+
+    @property
+    def believed(self) -> setup.Believed:
+        """What this run takes for true, by what has been calibrated until now."""
+        return setup.believed(self.resolved, self.calibrations)
+
+    def calibrated(self, calibration: Calibration) -> None:
+        """Keep what a stage has found: for the later stages, in the run folder, and for later runs on this station."""
+        store.save(self.folder.calibration, calibration)
+        file = store.save(store.folder_of(self.resolved), calibration)
+        self.calibrations.add(calibration, file)
+        self.results["calibration"] = self.calibrations.told()
+        self.save()
+
+    @contextmanager
+    def timed(self, devices: Devices) -> Iterator[None]:
+        """Add wall time and station time of the block to the results, whatever ends it."""
+        wall, station_ns = time.perf_counter(), devices.clock.now_ns()
+        try:
+            yield
+        finally:
+            timing = self.results["timing"]
+            timing["execute_wall_s"] += time.perf_counter() - wall
+            timing["execute_station_s"] += (devices.clock.now_ns() - station_ns) * 1e-9
 
     @property
     def opened(self) -> Devices | None:

@@ -145,17 +145,17 @@ def dump_resolved(resolved: Resolved) -> str:
     yaml = YAML()
     yaml.width = 120
     out = io.StringIO()
-    yaml.dump(_laid_out(data), out)
+    yaml.dump(laid_out(data), out)
     return out.getvalue()
 
 
-def _laid_out(value: Any) -> Any:
+def laid_out(value: Any) -> Any:
     """Lists of figures or names on one line, everything else in blocks."""
     if isinstance(value, dict):
-        return {key: _laid_out(item) for key, item in value.items()}
+        return {key: laid_out(item) for key, item in value.items()}
     if not isinstance(value, list):
         return value
-    sequence = CommentedSeq(_laid_out(item) for item in value)
+    sequence = CommentedSeq(laid_out(item) for item in value)
     if not any(isinstance(item, dict | list) for item in value):
         sequence.fa.set_flow_style()
     return sequence

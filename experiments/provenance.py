@@ -12,10 +12,11 @@ PACKAGES = ("extrinsic", "numpy", "torch", "cvxpy", "cvxpylayers", "mujoco", "ec
 
 def provenance() -> dict:
     """Revision (None outside a checkout) with a ``-dirty`` mark, package versions, and the host, JSON-able."""
-    return {"git": _revision(), "versions": _versions(), "host": _host()}
+    return {"git": revision(), "versions": _versions(), "host": _host()}
 
 
-def _revision() -> str | None:
+def revision() -> str | None:
+    """What git calls this checkout; None outside one."""
     root = Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():
         return None

@@ -21,6 +21,7 @@ class RunFolder:
         self.results = path / "results.json"
         self.report = path / "report.html"
         self.events = path / "events.jsonl"
+        self.calibration = path / "calibration"
 
     @classmethod
     def create(cls, experiment: str, out: Path | None) -> RunFolder:

@@ -14,6 +14,8 @@ from rich.console import Console
 
 from drivers.errors import CommandRefused, DriverError
 from drivers.wire.log import LogWriter
+from experiments.calibrate import store
+from experiments.calibrate.store import Calibrations
 from experiments.check import check
 from experiments.context import RunContext
 from experiments.exit_codes import STATUS, ExitCode, of_trials
@@ -42,7 +44,8 @@ class Outcome:
 def run(resolved: Resolved, out: Path | None = None, console: Console | None = None) -> Outcome:
     """Run an experiment. Raises InputError before anything was started; every later end is in the outcome."""
     console = console or Console(stderr=True)
-    check(resolved)  # what a dry run can find is found before anything is written
+    calibrations = store.load(resolved)
+    check(resolved, calibrations)  # what a dry run can find is found before anything is written
     folder = RunFolder.create(resolved.experiment.name, out)
     write_atomic(folder.experiment, dump_resolved(resolved))
     results: dict[str, Any] = {
@@ -55,7 +58,7 @@ def run(resolved: Resolved, out: Path | None = None, console: Console | None = N
         "seed": resolved.experiment.seed,
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "provenance": provenance(),
-        "calibration": {},
+        "calibration": calibrations.told(),
         "plans": [],
         "trials": [],
         "tables": [],
@@ -63,7 +66,7 @@ def run(resolved: Resolved, out: Path | None = None, console: Console | None = N
     }
     with Interrupt() as interrupt:
         try:
-            code, reason = _stages(resolved, folder, results, console, interrupt)
+            code, reason = _stages(resolved, calibrations, folder, results, console, interrupt)
         except KeyboardInterrupt:
             code, reason = ExitCode.INTERRUPTED, INTERRUPTED
         interrupt.closing()
@@ -76,6 +79,7 @@ def run(resolved: Resolved, out: Path | None = None, console: Console | None = N
 
 def _stages(
     resolved: Resolved,
+    calibrations: Calibrations,
     folder: RunFolder,
     results: dict[str, Any],
     console: Console,
@@ -87,7 +91,8 @@ def _stages(
     with ExitStack() as closing:
         log = closing.enter_context(LogWriter(folder.log, flush=resolved.station.log.flush))
         log.add_attachment("experiment.yaml", "application/yaml", folder.experiment.read_bytes())
-        context = RunContext(resolved, folder, results, log, progress, closing, _ask(console), interrupt.check)
+        ask, heed = _ask(console), interrupt.check
+        context = RunContext(resolved, calibrations, folder, results, log, progress, closing, ask, heed)
         context.save()
         try:
             for stage in resolved.experiment.stages:

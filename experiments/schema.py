@@ -13,11 +13,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field
 
 from control.settings import TrialSettings
 from experiments import registries
+from experiments.calibrate.schema import CalibrationStage, CalibrationUse, FrictionStage, Pair
 from mechanics.catalogue import ObjectModel, SensorModel
 from mechanics.yaml_input import Refusal, nearest, one_of, validated
 
 Vector2 = tuple[float, float]
-Pair = Literal["go-ground", "go-eo", "eo-ground"]
 
 
 def _named_or_inline(value: Any) -> str:
@@ -113,7 +113,7 @@ class ExecuteStage(_Model):
     trials: int = Field(default=1, ge=1, le=10_000)
 
 
-Stage = Annotated[PlanStage | ExecuteStage, Field(discriminator="stage")]
+Stage = Annotated[PlanStage | ExecuteStage | CalibrationStage, Field(discriminator="stage")]
 
 
 class Experiment(_Model):
@@ -129,6 +129,7 @@ class Experiment(_Model):
     friction: dict[Pair, Annotated[float, Field(gt=0, le=10)]] = Field(
         default_factory=dict, description="Coulomb coefficients by pair, where they are not the objects' own"
     )
+    calibration: CalibrationUse = CalibrationUse()
     trial: TrialSettings = Field(default_factory=lambda: TrialSettings.model_validate({}))
     stages: Annotated[tuple[Stage, ...], Field(min_length=1)]
     report: ReportConfig = ReportConfig()
@@ -141,7 +142,7 @@ class Experiment(_Model):
                 if stage.name in plans:
                     raise Refusal(f"a second plan named {stage.name!r}", "a name of its own", at=("stages", i, "name"))
                 plans.append(stage.name)
-            elif stage.plan not in plans:
+            elif isinstance(stage, ExecuteStage) and stage.plan not in plans:
                 expected = one_of(plans) if plans else "a plan stage before this one"
                 wrong = f"no plan named {stage.plan!r} comes before this stage"
                 raise Refusal(wrong, expected, nearest(stage.plan, plans), at=("stages", i, "plan"))
@@ -150,6 +151,9 @@ class Experiment(_Model):
     @model_validator(mode="after")
     def _friction_names_what_is_there(self) -> Experiment:
         if self.extrinsic_object is None:
+            for i, stage in enumerate(self.stages):
+                if isinstance(stage, FrictionStage) and "eo" in stage.pair.split("-"):
+                    raise Refusal("there is no extrinsic object", "go-ground alone", at=("stages", i, "pair"))
             for pair in self.friction:
                 if "eo" in pair.split("-"):
                     raise Refusal("there is no extrinsic object", "go-ground alone", at=("friction", pair))

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
+from control.observe import Observer
+from control.settings import TrialSettings
 from drivers.scene import Body, Scene, TagMount
-from estimation.force_torque import FreeAirLoad
+from drivers.station import Devices
+from estimation.force_torque import FreeAirLoad, WristSensor
 from experiments import registries
+from experiments.calibrate.models import CameraCalibration, ForceTorqueCalibration
+from experiments.calibrate.store import Calibrations
 from experiments.files import Resolved
 from experiments.schema import PlanStage
 from mechanics import se2
-from mechanics.camera import TagGeometry
+from mechanics.camera import CameraModel, TagGeometry
 from mechanics.elasticity import Elasticity
+from mechanics.readings import Array
 from planning.skills.base import Held
 from planning.task import Task
 
@@ -61,14 +69,67 @@ def scene(resolved: Resolved) -> Scene:
     )
 
 
-def task(resolved: Resolved, stage: PlanStage) -> Task:
+@dataclass(frozen=True, eq=False)
+class Believed:
+    """What planner, controllers and estimators take for true: as calibrated, else as catalogue and station say.
+
+    ``stiffness`` (3, 3) K in gocf, ``friction`` by pair, ``tool`` mass [kg] and centre (2,) in ee [m], ``camera``, and
+    the ``tags`` of each body: ``table``, ``go``, ``eo``. None: as the device describes it.
+    """
+
+    stiffness: Array
+    friction: dict[str, float]
+    tool: tuple[float, Array] | None
+    camera: CameraModel | None
+    tags: dict[str, tuple[TagGeometry, ...]]
+
+
+def believed(resolved: Resolved, calibrations: Calibrations) -> Believed:
+    """What a run believes that knows these calibrations."""
+    elasticity = calibrations.elasticity(resolved)
+    hung = calibrations.of(ForceTorqueCalibration)
+    camera = calibrations.of(CameraCalibration)
+    seat = calibrations.tag(resolved)
+    seen = tags(resolved)
+    if seat is not None:
+        seen["go"] = tuple(replace(tag, pose=seat.pose) if tag.id == seat.id else tag for tag in seen["go"])
+    return Believed(
+        resolved.sensor.stiffness if elasticity is None else elasticity.K,
+        {**resolved.friction, **{pair: found.mu for pair, found in calibrations.friction(resolved).items()}},
+        None if hung is None else (hung.tool_mass, np.array(hung.tool_centre)),
+        None if camera is None else camera.model,
+        seen,
+    )
+
+
+def observer(resolved: Resolved, devices: Devices, settings: TrialSettings, known: Believed) -> Observer:
+    """The eyes of a trial: arm, wrist sensor and camera, with what is known of them."""
+    wrist = devices.force_torque("wrist")
+    said = wrist.describe().extra
+    tool = said.get("tool", {"mass": 0.0, "centre": (0.0, 0.0)})
+    mass, centre = known.tool or (tool["mass"], np.array(tool["centre"], float))
+    camera = known.camera or CameraModel.from_dict(devices.camera.describe().extra["camera"])
+    return Observer(
+        arm=devices.arm,
+        wrist=wrist,
+        camera=devices.camera,
+        camera_model=camera,
+        tags=known.tags,
+        wrist_sensor=WristSensor(np.array(said["pose"], float), np.zeros(3), mass, centre, GRAVITY),
+        grasp=resolved.grasp,
+        window_ns=round(settings.window * 1e9),
+        frames=settings.tag_frames,
+    )
+
+
+def task(resolved: Resolved, stage: PlanStage, known: Believed) -> Task:
     """What the planner is asked for. Raises ValueError naming the parameter that the geometry does not allow."""
     held = Held(
         vertices=resolved.grasped.polygon.vertices,
         mass=resolved.grasped.mass,
         grasp=resolved.grasp,
-        stiffness=resolved.sensor.stiffness,
-        mu=resolved.friction["go-ground"],
+        stiffness=known.stiffness,
+        mu=known.friction["go-ground"],
         gravity=GRAVITY,
     )
     return registries.skills()[stage.skill].task(stage.skill_parameters, held)

@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from control.base import Controller
-from control.observe import Observer
 from control.trial import Trial, TrialResult, Watch
 from drivers.errors import DriverError, SimulationDiverged
 from drivers.station import Devices
-from estimation.force_torque import WristSensor
 from experiments import registries, setup
 from experiments.context import RunContext
 from experiments.metrics import errors_of
 from experiments.schema import ExecuteStage, PlanStage
-from mechanics.camera import CameraModel
 from mechanics.records import PhaseRecord, PlanarState, TrialRecord, WaypointRecord
 from planning.plan import Plan
 
@@ -32,7 +26,7 @@ def plan_stage(context: RunContext, stage: PlanStage) -> None:
 
     begin = time.perf_counter()
     with context.progress.step(f"plan {stage.name}"):
-        made = plan(setup.task(context.resolved, stage), stage.name, backend=stage.backend)
+        made = plan(setup.task(context.resolved, stage, context.believed), stage.name, backend=stage.backend)
     context.plans[stage.name] = made
     context.results["plans"].append(
         {
@@ -55,24 +49,12 @@ def execute_stage(context: RunContext, stage: ExecuteStage) -> None:
     """
     plan = context.plans[stage.plan]
     devices = context.devices()
-    with devices.arm.lease(context.holder), _timed(context, devices):
+    with devices.arm.lease(context.holder), context.timed(devices):
         for trial in range(stage.trials):
             for name in stage.controllers:
                 result = _one_trial(context, devices, plan, registries.controllers()[name], trial)
                 if result.status in ("device_failed", "stopped", "diverged"):
                     return
-
-
-@contextmanager
-def _timed(context: RunContext, devices: Devices) -> Iterator[None]:
-    """Add wall time and station time of the block to the results, whatever ends it."""
-    wall, station_ns = time.perf_counter(), devices.clock.now_ns()
-    try:
-        yield
-    finally:
-        timing = context.results["timing"]
-        timing["execute_wall_s"] += time.perf_counter() - wall
-        timing["execute_station_s"] += (devices.clock.now_ns() - station_ns) * 1e-9
 
 
 def _one_trial(
@@ -101,7 +83,7 @@ def _one_trial(
         try:
             if devices.simulation is not None:
                 devices.simulation.regrasp(trial)
-            observer = _observer(context, devices)
+            observer = setup.observer(context.resolved, devices, context.settings, context.believed)
             result = Trial(name, plan, controller, observer, clock, load, context.settings, watch).run()
         except SimulationDiverged as error:
             result = TrialResult("diverged", str(error), plan)
@@ -112,26 +94,6 @@ def _one_trial(
     context.write(replace(end, capture_ns=context.now_ns()))
     context.save()
     return result
-
-
-def _observer(context: RunContext, devices: Devices) -> Observer:
-    wrist = devices.force_torque("wrist")
-    said = wrist.describe().extra
-    tool = said.get("tool", {"mass": 0.0, "centre": (0.0, 0.0)})
-    settings = context.settings
-    return Observer(
-        arm=devices.arm,
-        wrist=wrist,
-        camera=devices.camera,
-        camera_model=CameraModel.from_dict(devices.camera.describe().extra["camera"]),
-        tags=setup.tags(context.resolved),
-        wrist_sensor=WristSensor(
-            np.array(said["pose"], float), np.zeros(3), tool["mass"], np.array(tool["centre"], float), setup.GRAVITY
-        ),
-        grasp=context.resolved.grasp,
-        window_ns=round(settings.window * 1e9),
-        frames=settings.tag_frames,
-    )
 
 
 def _truth(devices: Devices) -> PlanarState | None:

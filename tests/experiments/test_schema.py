@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from drivers.scene import Body
+from experiments.calibrate.store import Calibrations
 from experiments.check import check, tasks
 from experiments.files import PACKAGE, Resolved, dump_resolved, load, load_station
 from experiments.schema import ExecuteStage, PlanStage
+from experiments.setup import believed
 from mechanics import model_paths
 from mechanics.camera import CameraModel
 from mechanics.yaml_input import InputError
@@ -59,7 +61,8 @@ def test_a_bare_name_and_the_path_in_the_repository_mean_the_same(name):
 
 
 def test_grasped_pivoting_asks_for_the_motion_of_the_notes():
-    task = tasks(load("grasped_pivoting"))["pivot"]
+    resolved = load("grasped_pivoting")
+    task = tasks(resolved, believed(resolved, Calibrations()))["pivot"]
     np.testing.assert_allclose(np.degrees(task.go[[0, -1], 2]), [10, 35])
     assert len(task.go) == 20
 

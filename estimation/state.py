@@ -1,0 +1,248 @@
+"""The state that a trial acts on, from readings that come at their own rates, late, and out of order.
+
+In: the arm's poses, the wrist's wrenches, tactile poses, tag poses. Out: one time-stamped `State`. Everything is put
+in its place by the time of its capture; when it arrived plays no part. A stream's known delay is taken off first.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from estimation.contact_location import ContactEstimate, ContactLocator
+from estimation.contact_sites import faces_seen_by, ground_seen_by
+from estimation.contact_wrench import from_force_torque, wrist_covariance
+from estimation.force_torque import FreeAirLoad, WristSensor
+from estimation.grasp_filter import GraspFilter
+from estimation.tactile_pose import GraspPrior, PoseStatus, TactilePose
+from estimation.tag_pose import TagPose
+from mechanics import se2, wrench
+from mechanics.elasticity import Elasticity
+from mechanics.polygon import Polygon
+from mechanics.readings import Array, PoseReading, Status, WrenchReading
+from mechanics.task_plane import TaskPlane
+
+#: systematic error of a tag's pose: how it sits, what is left of the lens [m, m, rad]
+TAG_FLOOR = (1e-4, 1e-4, np.radians(0.1))
+_PLANAR = TaskPlane().wrench_to_planar(np.eye(6)).T  # (3, 6)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What is known at ``capture_ns``. Poses (3,) in W; None where nothing is known.
+
+    ``go_covariance`` (3, 3) is of a left perturbation of X_ee_go about ee's origin, in ee; ``wrench`` (3,) of the
+    sensor on the go about the grasp centre, axes of W, with its covariance; ``contact`` where the environment touches the go,
+    in the go's frame. ``ages`` [s] of each source at ``capture_ns``; ``status`` of the go's pose, with its ``reason``.
+    """
+
+    capture_ns: int
+    ee: Array
+    go: Array
+    go_covariance: Array
+    wrench: Array
+    wrench_covariance: Array
+    eo: Array | None = None
+    eo_covariance: Array | None = None
+    contact: ContactEstimate | None = None
+    ages: Mapping[str, float] = field(default_factory=dict)
+    status: PoseStatus = PoseStatus.OK
+    reason: str = ""
+
+
+class NoState(ValueError):
+    """There is no state yet: a source that it cannot do without has said nothing. The message names it."""
+
+
+class _Series:
+    """Vectors by the time of their capture, those of the last ``memory`` [ns]."""
+
+    def __init__(self, memory: int):
+        self._memory = memory
+        self._times: list[int] = []
+        self._values: dict[int, Array] = {}
+
+    def put(self, capture_ns: int, value: Array) -> None:
+        if capture_ns in self._values or (self._times and capture_ns < self._times[-1] - self._memory):
+            return
+        insort(self._times, capture_ns)
+        self._values[capture_ns] = value
+        while self._times[0] < self._times[-1] - self._memory:
+            del self._values[self._times.pop(0)]
+
+    @property
+    def newest(self) -> int | None:
+        return self._times[-1] if self._times else None
+
+    def at(self, capture_ns: int) -> Array:
+        """Between the readings before and after; beyond the ends, the end."""
+        i = bisect_left(self._times, capture_ns)
+        if i == 0:
+            return self._values[self._times[0]]
+        if i == len(self._times):
+            return self._values[self._times[-1]]
+        before, after = self._times[i - 1], self._times[i]
+        a, b = self._values[before], self._values[after]
+        return a + (b - a) * ((capture_ns - before) / (after - before))
+
+    def within(self, begin: int, end: int) -> Array:
+        """The values captured in (begin, end], (n, d); at least the nearest one."""
+        times = self._times[bisect_left(self._times, begin + 1) : bisect_left(self._times, end + 1)]
+        return np.array([self._values[t] for t in times] or [self.at(end)])
+
+
+@dataclass
+class StateEstimator:
+    """Joins the readings of one grasp.
+
+    ``grasp`` holds the belief about where the object lies in the fingers; ``elasticity`` and ``wrist`` turn readings
+    into displacements; ``window`` [s] is how far back wrenches are averaged, ``wrench_noise`` (3, 3) the covariance of
+    one planar reading in the sensor's frame. ``delays`` [s] by source (``arm``, ``wrist``, ``camera``, ``tactile``) are
+    taken off the capture times. ``locator`` finds the contact, with the ground or with an eo of ``eo_outline``. Not
+    thread-safe.
+    """
+
+    grasp: GraspFilter
+    elasticity: Elasticity
+    wrist: WristSensor
+    load: FreeAirLoad
+    window: float = 0.1
+    wrench_noise: Array = field(default_factory=lambda: np.diag([0.03, 0.03, 0.0006]) ** 2)
+    delays: Mapping[str, float] = field(default_factory=dict)
+    locator: ContactLocator | None = None
+    eo_outline: Polygon | None = None
+    memory: float = 2.0
+
+    def __post_init__(self) -> None:
+        memory = round(self.memory * 1e9)
+        self._ee, self._wrench = _Series(memory), _Series(memory)
+        self._eo: tuple[int, TagPose] | None = None
+        self._seen: dict[str, int] = {}
+        self._told: tuple[int, PoseStatus, str] | None = None
+
+    # -- in ----------------------------------------------------------------------------------------------------------
+
+    def push_pose(self, reading: PoseReading) -> None:
+        """X_W_ee from the arm. A reading that is not OK, or not finite, is left out."""
+        if reading.stamp.status is Status.OK and np.isfinite(reading.pose).all():
+            pose, newest = np.array(reading.pose, float), self._ee.newest
+            if newest is not None:
+                around = self._ee.at(newest)[2]
+                pose[2] = around + se2.wrap(pose[2] - around)
+            self._ee.put(self._time("arm", reading.stamp.capture_ns), pose)
+
+    def push_wrench(self, reading: WrenchReading) -> None:
+        """A wrist reading. One that is not OK, or not finite, is left out."""
+        if reading.stamp.status is Status.OK and np.isfinite(reading.wrench).all():
+            self._wrench.put(self._time("wrist", reading.stamp.capture_ns), np.asarray(reading.wrench, float))
+
+    def expected(self, capture_ns: int) -> GraspPrior:
+        """X_ee_go where a tactile image of this instant should find it. Raises NoState."""
+        at = self._time("tactile", capture_ns)
+        return self.grasp.predicted(at, self._displacement(at)[0])
+
+    def push_tactile(self, capture_ns: int, prior: GraspPrior, found: TactilePose) -> None:
+        """What a tactile image of ``capture_ns`` showed, read under ``prior`` (of `expected`), of all fingers fused."""
+        at = self._time("tactile", capture_ns)
+        if self._told is None or at >= self._told[0]:
+            self._told = at, found.status, found.reason
+        if found.status is PoseStatus.OK:
+            x = self._displacement(at)[0]
+            self.grasp.measured_through(at, x, prior, found.pose, found.information)
+            self._note("tactile", at)
+
+    def push_tag(self, body: str, capture_ns: int, found: TagPose) -> None:
+        """A body's tag pose in W: ``go`` or ``eo``."""
+        at = self._time("camera", capture_ns)
+        if body == "eo" and (self._eo is None or at >= self._eo[0]):
+            self._eo = at, found
+        elif body == "go":
+            x, ee, _ = self._displacement(at)
+            X_ee_go = se2.between(ee, found.pose)
+            # Δ about ee's origin, in ee, from the pose's error about the go's origin, in W
+            R = np.eye(3)
+            R[:2, :2] = se2.rotation(-ee[2])
+            lever = np.eye(3)
+            lever[:2, 2] = X_ee_go[1], -X_ee_go[0]
+            error = found.covariance + np.diag(TAG_FLOOR) ** 2
+            A = lever @ R
+            self.grasp.measure(at, x, X_ee_go, np.asarray(np.linalg.inv(A @ error @ A.T), np.float64))
+        self._note(f"{body} tag", at)
+
+    # -- out -----------------------------------------------------------------------------------------------------------
+
+    def state(self, capture_ns: int | None = None) -> State:
+        """The state at an instant, by default that of the newest pose and wrench. Raises NoState."""
+        at = capture_ns if capture_ns is not None else min(self._newest())
+        x, ee, w = self._displacement(at)
+        prior = self.grasp.predicted(at, x)
+        go = se2.compose(ee, prior.pose)
+        covariance = self._wrench_covariance(at, ee, go)
+        status, reason = self._status()
+        eo = self._eo
+        return State(
+            at,
+            ee,
+            go,
+            prior.covariance,
+            w,
+            covariance,
+            None if eo is None else eo[1].pose,
+            None if eo is None else eo[1].covariance,
+            self._contact(go, w, covariance),
+            {name: (at - seen) * 1e-9 for name, seen in {**self._seen, **self._streams()}.items()},
+            status,
+            reason,
+        )
+
+    def _status(self) -> tuple[PoseStatus, str]:
+        if self.grasp.slips:
+            return PoseStatus.SLIPPED, f"the object slipped in the fingers {self.grasp.slips} times since the grasp"
+        return (PoseStatus.OK, "") if self._told is None else self._told[1:]
+
+    def _contact(self, go: Array, w: Array, covariance: Array) -> ContactEstimate | None:
+        if self.locator is None:
+            return None
+        p_W = se2.compose(go, self.grasp.X_go_gocf)[:2]
+        wrench_ = from_force_torque(w, covariance, go, p_W, self.load)
+        around = [ground_seen_by(go)]
+        if self.eo_outline is not None and self._eo is not None:
+            around += faces_seen_by(se2.between(go, self._eo[1].pose), self.eo_outline)
+        return self.locator.locate(wrench_, around)
+
+    def _displacement(self, at: int) -> tuple[Array, Array, Array]:
+        """x (3,) in gocf, X_W_ee (3,), and the wrench (3,) about the grasp centre in axes of W, at an instant."""
+        self._newest()
+        ee = self._ee.at(at)
+        reading = self._wrench.within(at - round(self.window * 1e9), at).mean(axis=0)
+        gocf, x, w = ee, np.zeros(3), np.zeros(3)
+        for _ in range(3):  # the lever of a sagging object: each time a hundredth of the last
+            w = self.wrist.wrench_on_go(reading, ee, gocf[:2])
+            x = self.elasticity.displacement(wrench.rotated(w, -gocf[2]))
+            gocf = se2.compose(ee, se2.inverse(x))
+        return x, ee, w
+
+    def _wrench_covariance(self, at: int, ee: Array, go: Array) -> Array:
+        count = len(self._wrench.within(at - round(self.window * 1e9), at))
+        p_W = se2.compose(go, self.grasp.X_go_gocf)[:2]
+        return wrist_covariance(self.wrench_noise / count, se2.compose(ee, self.wrist.X_ee_s), p_W)
+
+    def _newest(self) -> tuple[int, int]:
+        ee, force = self._ee.newest, self._wrench.newest
+        if ee is None or force is None:
+            silent = "the arm" if ee is None else "the wrist force/torque sensor"
+            raise NoState(f"state: no reading of {silent} that can be trusted has come yet; check its stream")
+        return ee, force
+
+    def _streams(self) -> dict[str, int]:
+        ee, force = self._newest()
+        return {"arm": ee, "wrist": force}
+
+    def _time(self, source: str, capture_ns: int) -> int:
+        return capture_ns - round(self.delays.get(source, 0.0) * 1e9)
+
+    def _note(self, source: str, at: int) -> None:
+        self._seen[source] = max(at, self._seen.get(source, at))

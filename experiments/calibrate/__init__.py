@@ -1,0 +1,1 @@
+"""What a station knows of itself: the calibration files, and the stages that make them."""
