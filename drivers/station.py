@@ -23,11 +23,12 @@ from drivers.config import StationConfig
 from drivers.errors import DriverError, NotConnected
 from drivers.interfaces import Arm, Device, ForceTorqueSensor, Gripper, TactileSensor, TagCamera
 from drivers.wire import topics
-from drivers.wire.bus import Bus, Watch
+from drivers.wire.bus import Bus
 from drivers.wire.client import REMOTES, RemoteSensor
 from drivers.wire.clock import RemoteClock, RemoteSimulation
 from drivers.wire.link import Link
 from drivers.wire.log import LogWriter
+from drivers.wire.watch import Watch
 
 HOST_START = 20.0
 """How long a simulated host may take to start [s]; it takes about one."""

@@ -1,4 +1,4 @@
-"""One zenoh session, and what is opened on it: publishers, subscriptions, requests, services, liveliness.
+"""One zenoh session, and what is opened on it: streams, watches, requests, services.
 
 Scouting and gossip are off: a session listens only at, or connects only to, the endpoint it was given. Callbacks of
 this room only append or set a flag, because a slow one starves the whole session.
@@ -8,29 +8,24 @@ from __future__ import annotations
 
 import json
 import queue
-import struct
 import threading
 import time
 import weakref
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
 import zenoh
 
 from drivers.errors import DeviceFault, DeviceTimeout, NotConnected
 from drivers.wire import topics
+from drivers.wire.streams import Publisher, Subscription
+from drivers.wire.watch import Watch, undeclare, wait_matching
 
 LEASE = 1.0
 """After this long without a sign of life the peer counts as gone [s]: zenoh's own ten are too many beside an arm."""
 
-ATTACHMENT = struct.Struct("<qqq")
-"""Sequence number, capture time [ns], status: travels beside every sample."""
-
 _VERDICT = 0.5  # an empty answer and the news of a death come together, in either order [s]
-
-Handler = Callable[["Sample"], None]
-
 
 _open: weakref.WeakSet[Bus] = weakref.WeakSet()
 
@@ -38,166 +33,6 @@ _open: weakref.WeakSet[Bus] = weakref.WeakSet()
 def open_buses() -> list[Bus]:
     """The sessions of this process that were not closed; one that is left open keeps the interpreter from ending."""
     return list(_open)
-
-
-class Sample:
-    """One received message: its bytes as sent, what travelled beside them, and room for what they mean."""
-
-    __slots__ = ("capture_ns", "payload", "reading", "receive_ns", "sequence", "status", "topic")
-
-    def __init__(self, topic: str, payload: bytes, sequence: int, capture_ns: int, status: int, receive_ns: int):
-        self.topic, self.payload, self.sequence = topic, payload, sequence
-        self.capture_ns, self.status, self.receive_ns = capture_ns, status, receive_ns
-        self.reading: object = None  # decoded by who reads it first
-
-
-class Publisher:
-    """A stream on the bus. ``count`` messages were put on it, the newest with sequence number ``newest``."""
-
-    def __init__(self, bus: Bus, topic: str, type_name: str, lossy: bool = False):
-        self.topic, self.type_name = topic, type_name
-        self.count, self.newest = 0, -1
-        control = zenoh.CongestionControl.DROP if lossy else zenoh.CongestionControl.BLOCK
-        self._publisher = bus.session.declare_publisher(
-            topic,
-            encoding=zenoh.Encoding.APPLICATION_CDR.with_schema(type_name),
-            congestion_control=control,
-        )
-        self._withdraw = bus.token(topics.discovery(bus.zid, topic, type_name))
-
-    @property
-    def matched(self) -> bool:
-        """Whether anybody listens; a stream that nobody hears need not be encoded."""
-        return _matching(self._publisher)
-
-    def put(self, payload: bytes, sequence: int, capture_ns: int, status: int = 0) -> None:
-        """Publish one message."""
-        self._publisher.put(payload, attachment=ATTACHMENT.pack(sequence, capture_ns, status))
-        self.count += 1
-        self.newest = sequence
-
-    def close(self) -> None:
-        """Withdraw the stream; idempotent."""
-        self._withdraw()
-        _undeclare(self._publisher)
-
-
-class Subscription:
-    """A stream from the bus, delivered to any number of listeners within this process.
-
-    ``newest`` is the sequence number of the newest sample that every listener has been given, −1 before the first.
-    Samples without our attachment are counted in ``foreign`` and not delivered.
-    """
-
-    def __init__(self, bus: Bus, topic: str):
-        self.topic, self._bus = topic, bus
-        self.count, self.newest, self.foreign = 0, -1, 0
-        self._handlers: tuple[Handler, ...] = ()
-        self._arrived = threading.Condition()
-        self._subscriber = bus.session.declare_subscriber(topic, self._receive)
-
-    def listen(self, handler: Handler) -> Callable[[], None]:
-        """Give every sample to ``handler`` too; returns the way to stop."""
-        with self._arrived:
-            self._handlers = (*self._handlers, handler)
-
-        def stop() -> None:
-            with self._arrived:
-                self._handlers = tuple(h for h in self._handlers if h is not handler)
-                idle = not self._handlers
-            if idle:
-                self._bus.unsubscribe(self)  # so that its source need not produce it
-
-        return stop
-
-    def rewind(self) -> None:
-        """Forget what has arrived: the source starts to count anew."""
-        with self._arrived:
-            self.newest = -1
-
-    def wait(self, sequence: int, watch: Watch | None, deadline: float) -> bool:
-        """Wait until ``newest`` is at least ``sequence``; False past ``deadline`` or once ``watch`` is gone."""
-        if self.newest >= sequence:
-            return True
-        with self._arrived:
-            while self.newest < sequence:
-                left = deadline - time.monotonic()
-                if left <= 0 or (watch is not None and watch.gone):
-                    return False
-                self._arrived.wait(min(left, 0.05))
-            return True
-
-    def _receive(self, sample: zenoh.Sample) -> None:
-        attachment = sample.attachment
-        beside = b"" if attachment is None else attachment.to_bytes()
-        if len(beside) != ATTACHMENT.size:
-            self.foreign += 1
-            return
-        sequence, capture_ns, status = ATTACHMENT.unpack(beside)
-        payload = sample.payload.to_bytes()
-        done = Sample(self.topic, payload, sequence, capture_ns, status, time.time_ns())
-        for handler in self._handlers:
-            handler(done)
-        with self._arrived:
-            self.count += 1
-            self.newest = sequence
-            self._arrived.notify_all()
-
-    def close(self) -> None:
-        """Stop listening; idempotent."""
-        _undeclare(self._subscriber)
-
-
-class Watch:
-    """Whether the holder of a liveliness token is there. Once gone it stays gone."""
-
-    def __init__(self, bus: Bus, token: str):
-        self.token = token
-        self._seen, self._gone = threading.Event(), threading.Event()
-        self._hooks: list[Callable[[], None]] = []
-        self._lock = threading.Lock()
-        self._subscriber = bus.session.liveliness().declare_subscriber(token, self._changed, history=True)
-
-    def _changed(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT:
-            self._seen.set()
-            return
-        with self._lock:
-            self._gone.set()
-            hooks, self._hooks = self._hooks, []
-        for hook in hooks:
-            hook()
-
-    @property
-    def gone(self) -> bool:
-        """Whether the token vanished."""
-        return self._gone.is_set()
-
-    def seen(self, timeout: float) -> bool:
-        """Wait for the token to appear."""
-        return self._seen.wait(timeout)
-
-    def wait(self, timeout: float) -> bool:
-        """Wait for the token to vanish; True if it did."""
-        return self._gone.wait(max(timeout, 0.0))
-
-    def once_gone(self, hook: Callable[[], None]) -> Callable[[], None]:
-        """Call ``hook`` when the token vanishes (at once if it has); returns the way to withdraw it."""
-        with self._lock:
-            if not self._gone.is_set():
-                self._hooks.append(hook)
-                return lambda: self._withdraw(hook)
-        hook()
-        return lambda: None
-
-    def _withdraw(self, hook: Callable[[], None]) -> None:
-        with self._lock:
-            if hook in self._hooks:
-                self._hooks.remove(hook)
-
-    def close(self) -> None:
-        """Stop watching; idempotent."""
-        _undeclare(self._subscriber)
 
 
 class Query:
@@ -288,14 +123,15 @@ class Bus:
 
     def publisher(self, topic: str, type_name: str, lossy: bool = False) -> Publisher:
         """Announce a stream. ``lossy`` streams (images) drop rather than wait for a slow reader."""
-        return Publisher(self, topic, type_name, lossy)
+        withdraw = self.token(topics.discovery(self.zid, topic, type_name))
+        return Publisher(self.session, topic, type_name, lossy, withdraw)
 
     def subscribe(self, topic: str) -> Subscription:
         """The stream of a topic; one subscription per topic, shared by all its listeners."""
         with self._lock:
             found = self._subscriptions.get(topic)
             if found is None:
-                found = self._subscriptions[topic] = Subscription(self, topic)
+                found = self._subscriptions[topic] = Subscription(self.session, topic, self.unsubscribe)
             return found
 
     def unsubscribe(self, subscription: Subscription) -> None:
@@ -317,7 +153,7 @@ class Bus:
     def serve(self, key: str, handler: Callable[[Query], None]) -> Callable[[], None]:
         """Answer requests at ``key``; returns the way to stop. Each key has a thread of its own."""
         queryable = self.session.declare_queryable(key, lambda query: handler(Query(key, query)))
-        return lambda: _undeclare(queryable)
+        return lambda: undeclare(queryable)
 
     def token(self, key: str) -> Callable[[], None]:
         """Declare a liveliness token; returns the way to withdraw it, as closing the bus does."""
@@ -326,13 +162,13 @@ class Bus:
 
         def withdraw() -> None:
             self._tokens.discard(token)
-            _undeclare(token)
+            undeclare(token)
 
         return withdraw
 
     def watch(self, token: str) -> Watch:
         """Watch over a liveliness token."""
-        return Watch(self, token)
+        return Watch(self.session, token)
 
     def watch_all(self, pattern: str, gone: Callable[[str], None]) -> Callable[[], None]:
         """Call ``gone`` with each token of a pattern that vanishes; returns the way to stop."""
@@ -342,7 +178,7 @@ class Bus:
                 gone(str(sample.key_expr))
 
         subscriber = self.session.liveliness().declare_subscriber(pattern, changed, history=True)
-        return lambda: _undeclare(subscriber)
+        return lambda: undeclare(subscriber)
 
     def request(
         self,
@@ -373,7 +209,7 @@ class Bus:
         withdraw = watch.once_gone(lambda: answers.put("dead")) if watch is not None else None
         try:
             querier = self._querier(key)
-            if not self._matched(querier, deadline, watch):
+            if not wait_matching(querier, deadline, watch=watch):
                 if watch is not None and watch.gone:
                     raise dead
                 raise DeviceTimeout(device, asked, f"nobody serves {key}", "Check `extrinsic status STATION`")
@@ -405,24 +241,3 @@ class Bus:
                 # The bus waits by itself; zenoh's own time-out only bounds what is left behind.
                 found = self._queriers[key] = self.session.declare_querier(key, timeout=60.0)
             return found
-
-    @staticmethod
-    def _matched(querier: zenoh.Querier, deadline: float, watch: Watch | None) -> bool:
-        while not _matching(querier):
-            if time.monotonic() >= deadline or (watch is not None and watch.gone):
-                return False
-            time.sleep(0.0005)
-        return True
-
-
-def _matching(end: zenoh.Publisher | zenoh.Querier) -> bool:
-    """Whether the other end is there. The library's stub says bool; what comes is an object that is always true."""
-    status: Any = end.matching_status
-    return status if isinstance(status, bool) else status.matching
-
-
-def _undeclare(entity: zenoh.Publisher | zenoh.Subscriber | zenoh.Queryable | zenoh.LivelinessToken) -> None:
-    try:
-        entity.undeclare()
-    except zenoh.ZError:
-        return  # the session was closed before

@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -32,10 +32,12 @@ from drivers.interfaces import (
 )
 from drivers.wire import messages, topics
 from drivers.wire.arm_server import holder_id
-from drivers.wire.bus import Bus, Sample, Subscription, Watch
+from drivers.wire.bus import Bus
 from drivers.wire.codec import decode_reading
 from drivers.wire.lease import RENEWAL, TIME_TO_LIVE
 from drivers.wire.link import Link
+from drivers.wire.streams import Sample, Subscription
+from drivers.wire.watch import Watch
 from mechanics.readings import GripperReading, ImageReading, PoseReading, TagReading, WrenchReading
 
 
@@ -168,16 +170,11 @@ class RemoteSensor(Sensor[R]):
     def latest(self, timeout: float = 1.0) -> R:
         """As `Sensor.latest`; raises DeviceFault when the server has died."""
         self._need_connection("read")
-        watch = self._need_life("read")
-        withdraw = watch.once_gone(self._wake)
-        try:
-            with self._arrived:
-                self._await(
-                    lambda: self._kept[-1].capture_ns if self._kept else None, timeout, lambda: self._need_life("read")
-                )
-                sample = self._kept[-1]
-        finally:
-            withdraw()
+        with self._holding("read"):
+            self._await(
+                lambda: self._kept[-1].capture_ns if self._kept else None, timeout, lambda: self._need_life("read")
+            )
+            sample = self._kept[-1]
         return self._decode(sample)
 
     def since(self, capture_ns: int) -> list[R]:
@@ -200,6 +197,16 @@ class RemoteSensor(Sensor[R]):
     def lease_holders(self) -> list[str]:
         """Who commands the device by now; nobody does where there is no lease."""
         return []
+
+    @contextmanager
+    def _holding(self, asked: str) -> Iterator[None]:
+        """Hold `_arrived`; the server's death wakes who waits on it."""
+        withdraw = self._need_life(asked).once_gone(self._wake)
+        try:
+            with self._arrived:
+                yield
+        finally:
+            withdraw()
 
     def _wake(self) -> None:
         with self._arrived:
@@ -246,18 +253,12 @@ class RemoteTactile(RemoteSensor[ImageReading], TactileSensor):
         """As `ImagingSensor.capture`. A frame that is lost on its way is made up for by the next one of the stream."""
         deadline = time.monotonic() + timeout
         wanted = json.loads(self._command("capture", timeout=timeout).text)
-        with self._arrived:
+        with self._holding("capture"):
             while not self._kept or self._kept[-1].sequence < wanted:
-                left = deadline - time.monotonic()
-                if left <= 0:
-                    raise DeviceTimeout(
-                        self.name,
-                        "capture",
-                        f"its frame did not arrive within {timeout:g} s",
-                        "Check the network's load",
-                    )
-                self._arrived.wait(min(left, 0.05))
                 self._need_life("capture")
+                if not self._arrived.wait(deadline - time.monotonic()):
+                    got = f"its frame did not arrive within {timeout:g} s"
+                    raise DeviceTimeout(self.name, "capture", got, "Check the network's load")
             sample = self._kept[-1]
         return self._decode(sample)
 

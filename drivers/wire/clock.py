@@ -7,6 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import Any, cast
 
+import numpy as np
+
 from drivers.errors import DeviceFault
 from drivers.fault import Fault
 from drivers.wire import messages, topics
@@ -14,7 +16,7 @@ from drivers.wire.client import RemoteSensor
 from drivers.wire.codec import decode_reading
 from drivers.wire.link import Link
 from drivers.wire.watch import Watch
-from mechanics.readings import TruthReading
+from mechanics.readings import Array, TruthReading
 
 _PIECE_NS = 250_000_000  # station time per request: a long sleep stays interruptible, and each reply comes in time
 
@@ -87,6 +89,10 @@ class RemoteSimulation:
     def clamp(self, body: str | None) -> None:
         """As `Simulation.clamp`."""
         self._tell("clamp", body or "")
+
+    def show_board(self, board: dict | None, X_W_B: Array) -> None:
+        """As `Simulation.show_board`."""
+        self._tell("show_board", json.dumps({"board": board, "X_W_B": np.asarray(X_W_B, float).tolist()}))
 
     def inject(self, fault: Fault | dict) -> None:
         """As `Simulation.inject`. A crash takes the host with it before it could answer."""

@@ -15,7 +15,8 @@ from drivers.errors import (
     SimulationDiverged,
 )
 from drivers.wire import messages, topics
-from drivers.wire.bus import Bus, Watch
+from drivers.wire.bus import Bus
+from drivers.wire.watch import Watch
 
 _ARRIVAL = 2.0  # what was published before a reply arrives with it; this long after, it is lost [s]
 

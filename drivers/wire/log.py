@@ -19,8 +19,9 @@ from mcap.writer import CompressionType, Writer
 
 from drivers.errors import DeviceFault
 from drivers.wire import messages
-from drivers.wire.bus import Bus, Sample
+from drivers.wire.bus import Bus
 from drivers.wire.records import STREAMS, Record, encode_record
+from drivers.wire.streams import Sample
 
 ROOM = 256 * 2**20
 """Bytes that may wait to be written: half a minute of everything, half a gigabyte of a stuck disk's arrears never."""
@@ -54,6 +55,7 @@ class LogWriter:
         self._jobs: deque[tuple[Job | None, str, bytes, int, int, int]] = deque()
         self._waiting, self._room = 0, room
         self._lock = threading.Lock()
+        self._settled = threading.Condition(self._lock)  # on the disk, or failed
         self._stops: list[Callable[[], None]] = []
         self._closing, self._closed = threading.Event(), False
         self._period = flush * _MARGIN
@@ -126,18 +128,20 @@ class LogWriter:
 
         def sync(_: Writer) -> None:
             self._sync()
-            done.set()
+            with self._settled:
+                done.set()
+                self._settled.notify_all()
 
         if not self._put(sync, "", b"", 0, 0, 0):
             if self.failure is not None:
                 raise self.failure
             return  # closed: everything is on the disk
-        deadline = time.monotonic() + timeout
-        while not done.wait(_TICK):
-            if self.failure is not None:
-                raise self.failure
-            if time.monotonic() >= deadline:
-                raise DeviceFault("log", f"write {self.path}", f"not done within {timeout:g} s", "Check the disk")
+        with self._settled:
+            settled = self._settled.wait_for(lambda: done.is_set() or self.failure is not None, timeout)
+        if not settled:
+            raise DeviceFault("log", f"write {self.path}", f"not done within {timeout:g} s", "Check the disk")
+        if not done.is_set() and self.failure is not None:
+            raise self.failure
 
     def close(self) -> None:
         """Write what waits, finish the file, join the thread; idempotent. Raises DeviceFault if anything failed."""
@@ -197,6 +201,7 @@ class LogWriter:
                 self.overflows += sum(job[0] is None for job in self._jobs)
                 self._jobs.clear()
                 self.failure = DeviceFault("log", f"write {self.path}", str(error), "Check the disk")
+                self._settled.notify_all()
 
     def _drain(self) -> None:
         jobs, writer = self._jobs, self._writer

@@ -25,8 +25,9 @@ from drivers.errors import (
 )
 from drivers.interfaces import Device, ForceTorqueSensor, Gripper, ImagingSensor, Sensor, TactileSensor, TagCamera
 from drivers.wire import messages, topics
-from drivers.wire.bus import Bus, Publisher, Query
+from drivers.wire.bus import Bus, Query
 from drivers.wire.codec import Reading, encode_compressed, encode_reading
+from drivers.wire.streams import Publisher
 from mechanics.readings import ImageReading, Stamp
 
 log = logging.getLogger(__name__)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
 from drivers.config import ArmConfig, ForceTorqueConfig, GripperConfig, StationConfig, WorldConfig
 from drivers.scene import Body, Scene
+from drivers.sim.mismatch import Mismatch
+from drivers.sim.world import World
 
 #: the paper's K of the Soft Bubbles, its angle scaled by 44.8 mm
 BUBBLE = (
@@ -56,3 +59,18 @@ def station() -> StationConfig:
             "table_ft": ForceTorqueConfig(kind="force_torque", mount="table", pose=(0.05, -0.1, 0.0)),
         },
     )
+
+
+@pytest.fixture
+def world_of(station: StationConfig, make_scene, monkeypatch) -> Callable[..., World]:
+    """A world of a profile, every device open, reset to a seed."""
+
+    def make(figures: Mismatch, seed: int = 0, config: StationConfig = station, **scene: Any) -> World:
+        monkeypatch.setattr("drivers.sim.world.load_profile", lambda _name: figures)
+        world = World(config)
+        for device in world.devices.values():
+            device.connect()
+        world.reset(seed, make_scene(**scene))
+        return world
+
+    return make

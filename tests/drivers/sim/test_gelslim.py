@@ -1,8 +1,6 @@
-"""The simulated GelSlim: where its markers and edges lie, and how its pictures compare with those of real gels."""
+"""The simulated GelSlim: where its markers and edges lie, what it says of itself, and its noise."""
 
 import json
-import os
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,64 +10,18 @@ from scipy.ndimage import gaussian_filter1d
 
 from drivers.config import TactileConfig
 from drivers.errors import NotConnected
-from drivers.sim.finger import FingerView
 from drivers.sim.gel import Face, GelPad
 from drivers.sim.gel_noise import GelNoise
 from drivers.sim.gelslim import SimGelSlim
-from drivers.sim.mismatch import Mismatch, load_profile
 from mechanics.readings import Status
 
-BOX = np.array([(-0.008, -0.05), (0.008, -0.05), (0.008, 0.010), (-0.008, 0.010)])
-BOARD = np.array([(-0.05, -0.05), (0.05, -0.05), (0.05, 0.05), (-0.05, 0.05)])
-HEXAGON = 0.008 * np.array([(np.cos(a), np.sin(a)) for a in np.arange(6) * np.pi / 3])
-NOWHERE = np.array([10.0, 0.0, 0.0])
-
-
-def pose(x_mm: float = 0, y_mm: float = 0, degrees: float = 0) -> np.ndarray:
-    return np.array([x_mm / 1e3, y_mm / 1e3, np.deg2rad(degrees)])
+from .finger_cases import BOARD, BOX, HEXAGON, FakeWorld, config, opened, pose, view
 
 
 def moved(X: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (n, 2) by complex numbers: a pose is z -> e^{iθ} z + (x + iy)."""
     z = np.exp(1j * X[2]) * (points[:, 0] + 1j * points[:, 1]) + complex(X[0], X[1])
     return np.stack((z.real, z.imag), axis=-1)
-
-
-def view(outline: np.ndarray = BOX, rest: np.ndarray = NOWHERE, shear: np.ndarray | None = None, held: bool = True):
-    """The object lay at ``rest`` in the ee when it was grasped and has moved by ``shear`` (about the ee) since."""
-    shear = pose() if shear is None else shear
-    z = np.exp(1j * shear[2]) * complex(*rest[:2]) + complex(*shear[:2])
-    return FingerView(outline, np.array([z.real, z.imag, rest[2] + shear[2]]), shear, held)
-
-
-class FakeWorld:
-    """A clock, a profile and what the fingers feel."""
-
-    lockstep = True
-
-    def __init__(self, felt: FingerView | None = None, noise: GelNoise | None = None):
-        self.felt = view() if felt is None else felt
-        self.profile = Mismatch(gel=noise or GelNoise())
-        self.time = 3
-
-    def now_ns(self) -> int:
-        return self.time
-
-    def finger_view(self) -> FingerView:
-        return self.felt
-
-
-def config(finger: str = "left", width: int = 320, height: int = 240, indentation: float = 0.0008) -> TactileConfig:
-    return TactileConfig.model_validate(
-        {"kind": "tactile", "sensor": "gelslim", "finger": finger, "width": width, "height": height}
-        | {"indentation": indentation}
-    )
-
-
-def opened(world: FakeWorld, finger: str = "left", width: int = 320, height: int = 240) -> SimGelSlim:
-    sensor = SimGelSlim("finger", config(finger, width, height), world)
-    sensor.connect()
-    return sensor
 
 
 def pixels_of(sensor: SimGelSlim, p_ee: np.ndarray, height: float) -> np.ndarray:
@@ -382,133 +334,3 @@ def test_vignetting_takes_its_share_of_light_from_the_corners() -> None:
     bright = plain[:3, :3] > 20
     assert (vignetted / np.maximum(plain, 1))[:3, :3][bright].mean() == pytest.approx(0.6, abs=0.03)
     assert np.abs(vignetted - plain)[118:122, 158:162].max() <= 1
-
-
-# -- against pictures of real gels -------------------------------------------------------------------------------------
-
-DATA = Path(os.environ.get("EXTRINSIC_DATA", Path(__file__).parents[4] / "shared" / "data"))
-FIGURES = Path(__file__).parents[3] / "build" / "figures"
-gelslim_data = pytest.mark.skipif(not (DATA / "gelslim").is_dir(), reason="no pictures of a real GelSlim")
-gelsight_data = pytest.mark.skipif(not (DATA / "gelsight_edges").is_dir(), reason="no pictures of a real GelSight")
-
-
-def read(path: str | Path) -> np.ndarray:
-    image = cv2.imread(str(path))
-    assert image is not None
-    return image.astype(np.float32)
-
-
-def patch_statistics(change: np.ndarray) -> tuple[float, float]:
-    """Contrast and edge width of the largest contact patch in a picture less its reference.
-
-    Contrast: median over the patch of the largest change of a channel, where it exceeds 20 grey levels. Width: pixels
-    over which the mean change goes from 10 to 90 % of its peak, by distance from the patch's boundary.
-    """
-    size = cv2.GaussianBlur(np.abs(change).max(axis=2).astype(np.float32), (0, 0), 1.0)
-    clear = (size > 20).astype(np.uint8)
-    closed = cv2.morphologyEx(clear, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
-    _, labels, areas, _ = cv2.connectedComponentsWithStats(closed)
-    patch = (labels == 1 + areas[1:, cv2.CC_STAT_AREA].argmax()).astype(np.uint8)
-    outlines, _ = cv2.findContours(patch, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    whole = cv2.drawContours(np.zeros_like(patch), outlines, -1, 1, -1)
-    depth = cv2.distanceTransform(whole, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - whole, cv2.DIST_L2, 5)
-    bins = [(depth >= i) & (depth < i + 1) for i in range(-25, 20)]
-    profile = np.array([size[b].mean() if b.any() else 0.0 for b in bins])
-    top = profile.argmax()
-    level = (profile - np.median(size[depth < -25])) / (profile[top] - np.median(size[depth < -25]))
-    low, high = (top - int(np.argmax(level[top::-1] < share)) for share in (0.1, 0.9))
-    return float(np.median(size[(patch > 0) & (clear > 0)])), float(high - low)
-
-
-def noise_level(one: np.ndarray, other: np.ndarray) -> float:
-    """Standard deviation of a pixel beyond slow shading, by two pictures of the same."""
-    difference = one - other
-    return float((difference - cv2.GaussianBlur(difference, (0, 0), 8)).std() / np.sqrt(2))
-
-
-def marker_pitch(image: np.ndarray) -> float:
-    """Median distance [px] of a marker's four nearest neighbours, in the inner half of the picture."""
-    grey = image.mean(axis=2).astype(np.float32)
-    ink = cv2.GaussianBlur(cv2.GaussianBlur(grey, (0, 0), 10) - grey, (0, 0), 2)
-    peak = (ink == cv2.dilate(ink, np.ones((11, 11)))) & (ink > 8)
-    points = np.argwhere(peak)[:, ::-1].astype(float)
-    distance = np.linalg.norm(points[:, None] - points, axis=-1)
-    size = np.array(grey.shape[::-1])
-    inner = (np.abs(points - size / 2) < size / 4).all(axis=1)
-    return float(np.median(np.sort(distance[inner], axis=1)[:, 1:5]))
-
-
-def simulated(outline: np.ndarray, rest: np.ndarray, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-    sensor = opened(FakeWorld(view(outline, rest), GelNoise(noise=noise)), "left", 427, 320)
-    sensor.restart(np.random.default_rng(3))
-    return sensor.capture().image.astype(np.float32), sensor.reference().astype(np.float32)
-
-
-PRESSED = [(HEXAGON * 0.6, pose(0, 0, 6)), (HEXAGON * 0.6, pose(-5, 3, 20)), (HEXAGON, pose(3, -2, 0))]
-
-
-@gelslim_data
-def test_contact_contrast_and_edge_width_are_those_of_a_real_gelslim() -> None:
-    reference = read(DATA / "gelslim" / "ref.jpg")
-    presses = sorted((DATA / "gelslim" / "press").glob("*.jpg"))
-    real = np.array([patch_statistics(read(path) - reference) for path in presses])
-    sim = np.array([patch_statistics(gel - bare) for gel, bare in (simulated(*p) for p in PRESSED)])
-    (contrast, width), (sim_contrast, sim_width) = np.median(real, axis=0), np.median(sim, axis=0)
-    assert 40 < contrast < 70
-    assert 12 < width < 18
-    assert sim_contrast == pytest.approx(contrast, rel=0.3)
-    assert sim_width == pytest.approx(width, abs=3)
-
-
-@gelslim_data
-def test_markers_stand_as_far_apart_as_those_of_a_real_gelslim() -> None:
-    real = marker_pitch(read(DATA / "gelslim" / "ref.jpg"))
-    assert marker_pitch(simulated(HEXAGON, NOWHERE)[1]) == pytest.approx(real, rel=0.08)
-
-
-@gelslim_data
-def test_the_bare_gel_has_the_brightness_and_markers_the_darkness_of_a_real_one() -> None:
-    real, sim = read(DATA / "gelslim" / "ref.jpg"), simulated(HEXAGON, NOWHERE)[1]
-    middle = np.s_[110:210, 140:290]
-    for statistic in (np.median, lambda grey: np.median(grey) - np.percentile(grey, 2)):
-        assert statistic(sim[middle].mean(axis=2)) == pytest.approx(statistic(real[middle].mean(axis=2)), rel=0.3)
-
-
-@gelslim_data
-def test_the_noise_of_the_lab_is_that_of_real_gels() -> None:
-    folder = DATA / "gelslim"
-    real = noise_level(read(folder / "ref.jpg"), read(folder / "objects" / "reconstruct_0.jpg"))
-    sensor = opened(FakeWorld(noise=load_profile("lab").gel), "left", 427, 320)
-    sim = noise_level(*(sensor.capture().image.astype(np.float32) for _ in range(2)))
-    assert sim == pytest.approx(real, rel=0.2)
-
-
-@gelsight_data
-def test_a_wall_is_as_clear_as_a_facet_of_the_edges_in_real_gelsight_pictures() -> None:
-    folder = DATA / "gelsight_edges"
-    background, facets = read(folder / "background.png"), []
-    for i in range(11):
-        label, angle = np.load(folder / str(i) / "label.npz"), 0.0
-        angle = np.deg2rad(float(label["line_angle"]))
-        along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
-        u, v = np.linspace(-0.3, 0.3, 61) * float(label["line_length"]), np.arange(-40, 40.5, 0.5)
-        where = (label["line_center"] + u[:, None, None] * along + v[:, None] * across).astype(np.float32)
-        change = read(folder / str(i) / "gelsight.png") - background
-        profile = np.median(cv2.remap(change, where[..., 0], where[..., 1], cv2.INTER_LINEAR), axis=0)
-        facets.append(np.ptp(profile, axis=0).max() / 2)  # two facets, one bright and one dark
-    walls = []
-    for outline, rest in PRESSED:
-        gel, bare = simulated(outline, rest)
-        walls.append(np.percentile(np.abs(gel - bare).max(axis=2)[np.abs(gel - bare).max(axis=2) > 20], 90))
-    assert 50 < np.median(facets) < 110
-    assert np.median(walls) == pytest.approx(np.median(facets), rel=0.4)
-
-
-@gelslim_data
-def test_a_figure_puts_real_and_simulated_pictures_side_by_side() -> None:
-    folder = DATA / "gelslim"
-    real = [folder / "ref.jpg", folder / "press" / "sample_10.jpg", folder / "objects" / "reconstruct_1.jpg"]
-    shown = [simulated(HEXAGON, NOWHERE)[1], simulated(*PRESSED[1], noise=3.0)[0], simulated(BOX, pose(2, 1, -30))[0]]
-    rows = [np.hstack([read(path) for path in real]), np.hstack(shown)]
-    FIGURES.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(FIGURES / "gelslim_real_above_simulated_below.png"), np.vstack(rows).astype(np.uint8))

@@ -11,16 +11,9 @@ import zenoh
 
 from drivers.errors import DeviceFault, DeviceTimeout, NotConnected
 from drivers.wire import messages, topics
-from drivers.wire.bus import ATTACHMENT, Bus, Query, Sample, open_buses
-
-
-def until(true: Callable[[], bool], timeout: float = 5.0) -> bool:
-    deadline = time.monotonic() + timeout
-    while not true():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.001)
-    return True
+from drivers.wire.bus import Bus, Query, open_buses
+from drivers.wire.streams import ATTACHMENT, Sample
+from drivers.wire.watch import Watch, wait_matching
 
 
 def test_what_is_published_arrives_whole_and_in_order(served: Bus, joined: Bus) -> None:
@@ -28,7 +21,7 @@ def test_what_is_published_arrives_whole_and_in_order(served: Bus, joined: Bus) 
     got: list[Sample] = []
     subscription = joined.subscribe("lab/ft/wrench")
     subscription.listen(got.append)
-    assert until(lambda: publisher.matched)
+    assert publisher.wait_matched(5.0)
     for i in range(2000):
         publisher.put(bytes([i % 256]) * 80, i, 10 * i, 1)
     assert subscription.wait(1999, None, time.monotonic() + 5)
@@ -40,17 +33,18 @@ def test_what_is_published_arrives_whole_and_in_order(served: Bus, joined: Bus) 
 def test_a_stream_that_nobody_hears_is_not_matched(served: Bus, joined: Bus) -> None:
     publisher = served.publisher("lab/ft/wrench", messages.WRENCH)
     assert not publisher.matched
+    assert not publisher.wait_matched(0.05)
     stop = joined.subscribe("lab/ft/wrench").listen(lambda _: None)
-    assert until(lambda: publisher.matched)
+    assert publisher.wait_matched(5.0)
     stop()
-    assert until(lambda: not publisher.matched)
+    assert publisher.wait_matched(5.0, wanted=False)
 
 
 def test_every_sample_says_its_type(served: Bus, joined: Bus) -> None:
     publisher = served.publisher("lab/ft/wrench", messages.WRENCH)
     got: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
     joined.session.declare_subscriber("lab/**", got.put)
-    assert until(lambda: publisher.matched)
+    assert publisher.wait_matched(5.0)
     publisher.put(b"x", 3, 4)
     sample = got.get(timeout=5)
     assert str(sample.encoding) == "application/cdr;geometry_msgs/msg/WrenchStamped"
@@ -72,8 +66,12 @@ def test_samples_of_others_without_our_attachment_are_counted_not_delivered(serv
     got: list[Sample] = []
     subscription.listen(got.append)
     publisher = served.session.declare_publisher("lab/ft/wrench")
-    assert until(lambda: publisher.put(b"hello") or subscription.foreign > 0)
-    assert got == []
+    assert wait_matching(publisher, time.monotonic() + 5)
+    publisher.put(b"hello")
+    publisher.put(b"ours", attachment=ATTACHMENT.pack(0, 0, 0))  # what came before it has been dealt with
+    assert subscription.wait(0, None, time.monotonic() + 5)
+    assert [sample.payload for sample in got] == [b"ours"]
+    assert subscription.foreign == 1
 
 
 def test_a_request_is_answered(served: Bus, joined: Bus) -> None:
@@ -122,6 +120,56 @@ def test_a_death_ends_the_request_that_waits_for_it(endpoint: str) -> None:
             closer.join()
             with pytest.raises(DeviceFault, match="died"):
                 client.request("lab/slow", b"", device="lab", asked="wait again", watch=watch)
+
+
+class EarlyRequest:
+    """A request, in a thread of its own, whose service is not there yet; ``waiting`` once it waits for it."""
+
+    def __init__(self, bus: Bus, watch: Watch):
+        self._bus, self._watch = bus, watch
+        assert watch.seen(5)
+        self.outcome: queue.SimpleQueue[bytes | DeviceFault | DeviceTimeout] = queue.SimpleQueue()
+        hooks, once_gone = threading.Semaphore(0), watch.once_gone
+
+        def told(hook: Callable[[], None]) -> Callable[[], None]:
+            withdraw = once_gone(hook)
+            hooks.release()
+            return withdraw
+
+        watch.once_gone = told  # type: ignore[method-assign]
+        self._thread = threading.Thread(target=self._ask)
+        self._thread.start()
+        self.waiting = hooks.acquire(timeout=5) and hooks.acquire(timeout=5)  # for the answer, then for the service
+
+    def _ask(self) -> None:
+        try:
+            answer = self._bus.request("lab/late", b"", device="lab", asked="x", timeout=30, watch=self._watch)
+            self.outcome.put(answer)
+        except (DeviceFault, DeviceTimeout) as error:
+            self.outcome.put(error)
+
+    def end(self) -> bytes | DeviceFault | DeviceTimeout:
+        """What came of it, within the two seconds that a wait without news would outlast."""
+        try:
+            return self.outcome.get(timeout=2)
+        finally:
+            self._thread.join()
+
+
+def test_a_request_that_comes_before_its_service_is_answered_once_that_is_there(served: Bus, joined: Bus) -> None:
+    served.token("lab/late/alive")
+    request = EarlyRequest(joined, joined.watch("lab/late/alive"))
+    assert request.waiting
+    served.serve("lab/late", lambda query: query.reply(b"here"))
+    assert request.end() == b"here"
+
+
+def test_a_death_ends_the_wait_for_a_service(served: Bus, joined: Bus) -> None:
+    die = served.token("lab/late/alive")
+    request = EarlyRequest(joined, joined.watch("lab/late/alive"))
+    assert request.waiting
+    die()
+    assert "died" in str(request.end())
 
 
 def test_the_first_request_after_opening_is_answered(served: Bus, another: Callable[[], Bus]) -> None:

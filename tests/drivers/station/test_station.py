@@ -2,99 +2,21 @@
 
 from __future__ import annotations
 
-import gc
-import os
-import signal
-import socket
-import subprocess
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from drivers.config import StationConfig
-from drivers.errors import CommandRefused, DeviceFault, DriverError, NotConnected
+from drivers.errors import CommandRefused, DeviceFault, NotConnected
 from drivers.interfaces import ArmTarget
 from drivers.sim.world import World
-from drivers.station import Devices, Station, listening
-from drivers.wire.bus import Bus, open_buses
+from drivers.station import Devices, Station
 from drivers.wire.log_reader import LogReader
 from mechanics.readings import TruthReading, WrenchReading
 
-ROOT = Path(__file__).parents[2]
-WIDTH, HEIGHT, MASS = 0.05, 0.1469, 0.1
-
-
-def station(clock: str = "lockstep", **devices: Any) -> StationConfig:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    kinds = {
-        "arm": {"kind": "arm"},
-        "wrist_ft": {"kind": "force_torque", "mount": "wrist"},
-        "table_ft": {"kind": "force_torque", "mount": "table"},
-        "gripper": {"kind": "gripper"},
-    }
-    return StationConfig.model_validate(
-        {
-            "name": "sim",
-            "world": {"clock": clock},
-            "bus": {"endpoint": f"tcp/127.0.0.1:{port}", "timeout": 5.0},
-            "devices": kinds | devices,
-        }
-    )
-
-
-def scene() -> dict:
-    x, y = WIDTH / 2, HEIGHT / 2
-    return {
-        "grasped": {"name": "go", "vertices": [(-x, -y), (x, -y), (x, y), (-x, y)], "mass": MASS},
-        "grasp": (0.0, 0.045, 0.0),
-        "stiffness": ((2000.0, 0, 0), (0, 2000.0, 0), (0, 0, 3.0)),
-        "friction": {"go-ground": 0.33},
-        "start": (0.0, 0.2, 0.0),
-    }
-
-
-@pytest.fixture(autouse=True)
-def nothing_is_left_running() -> Iterator[None]:
-    yield
-    gc.collect()
-    left = open_buses()
-    for bus in left:
-        bus.close()
-    assert not left
-
-
-@pytest.fixture
-def config() -> StationConfig:
-    return station()
-
-
-@pytest.fixture
-def devices(config: StationConfig) -> Iterator[Devices]:
-    with Station(config).connect() as opened:
-        assert opened.simulation is not None
-        opened.simulation.reset(0, scene())
-        yield opened
-
-
-def gone(pid: int, timeout: float = 5.0) -> bool:
-    deadline = time.monotonic() + timeout
-    while time.monotonic() < deadline:
-        try:
-            state = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-        except FileNotFoundError:
-            return True
-        if state == "Z":
-            return True
-        time.sleep(0.01)
-    return False
+from .cases import MASS, scene, station
 
 
 def drive(devices: Devices, steps: int) -> None:
@@ -228,98 +150,6 @@ def test_before_the_first_reset_devices_describe_themselves_and_time_cannot_pass
             devices.clock.sleep(0.1)
 
 
-@pytest.mark.parametrize(("how", "bound"), [(signal.SIGKILL, 1.0), (signal.SIGSTOP, 2.0)], ids=["killed", "frozen"])
-def test_a_dead_host_is_noticed_by_every_call(config: StationConfig, how: signal.Signals, bound: float) -> None:
-    with Station(config).connect() as devices:
-        assert devices.simulation is not None
-        assert devices.host is not None
-        devices.simulation.reset(0, scene())
-        devices.arm.acquire("test")
-        devices.clock.sleep(0.1)
-        pid = devices.host.pid
-        struck: list[float] = []
-
-        def strike() -> None:
-            struck.append(time.monotonic())
-            os.kill(pid, how)
-
-        timer = threading.Timer(0.1, strike)
-        timer.start()
-        with pytest.raises(DeviceFault, match="world"):
-            while True:
-                devices.clock.sleep(0.5)
-        assert time.monotonic() - struck[0] < bound
-        timer.join()
-        calls: dict[str, Callable[[], object]] = {
-            "arm": lambda: devices.arm.command(ArmTarget(np.zeros(3), np.zeros(3), 0.1)),
-            "wrist_ft": devices.force_torque("wrist").latest,
-            "gripper": lambda: devices.gripper.grasp(10.0),
-        }
-        for name, call in calls.items():
-            start = time.monotonic()
-            with pytest.raises(DeviceFault, match=name):
-                while time.monotonic() - start < 2.0:  # the news of each device's death travels by itself
-                    call()
-        closing = time.monotonic()
-    assert time.monotonic() - closing < 5.0
-    assert gone(pid)
-
-
-def test_a_log_survives_the_death_of_the_host(config: StationConfig, tmp_path: Path) -> None:
-    with Station(config).connect() as devices:
-        assert devices.simulation is not None
-        assert devices.host is not None
-        with devices.log(tmp_path / "log.mcap") as log:
-            devices.simulation.reset(0, scene())
-            devices.clock.sleep(0.5)
-            os.kill(devices.host.pid, signal.SIGKILL)
-            with pytest.raises(DriverError):
-                devices.clock.sleep(0.5)
-    reader = LogReader(tmp_path / "log.mcap")
-    assert reader.counts()["sim/wrist_ft/wrench"] == log.counts["sim/wrist_ft/wrench"] >= 500
-    assert reader.complete
-
-
-def test_closing_ends_and_reaps_the_host(config: StationConfig) -> None:
-    with Station(config).connect() as devices:
-        assert devices.host is not None
-        pid = devices.host.pid
-        assert listening(config.bus.endpoint)
-    assert not Path(f"/proc/{pid}").exists()
-    assert not listening(config.bus.endpoint)
-
-
-_RUNNER = """
-import json, sys
-from drivers.config import StationConfig
-from drivers.station import Station
-with Station(StationConfig.model_validate_json(sys.argv[1])).connect() as devices:
-    sys.stdout.write(f"{devices.host.pid}\\n"); sys.stdout.flush()
-    sys.stdin.read()
-"""
-
-
-def test_the_host_ends_when_its_starter_is_killed(config: StationConfig) -> None:
-    runner = subprocess.Popen(
-        [sys.executable, "-c", _RUNNER, config.model_dump_json()],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        cwd=ROOT,
-    )
-    assert runner.stdin is not None and runner.stdout is not None
-    with runner.stdin, runner.stdout:
-        pid = int(runner.stdout.readline())
-        runner.kill()
-        runner.wait(10)
-        assert gone(pid)
-
-
-def test_an_interrupt_from_the_keyboard_does_not_reach_the_host(config: StationConfig) -> None:
-    with Station(config).connect() as devices:
-        assert devices.host is not None
-        assert os.getpgid(devices.host.pid) != os.getpgid(0)
-
-
 def test_a_second_client_joins_and_sees_the_same(devices: Devices, config: StationConfig) -> None:
     with Station(config).connect() as second:
         devices.clock.sleep(0.05)
@@ -329,24 +159,6 @@ def test_a_second_client_joins_and_sees_the_same(devices: Devices, config: Stati
         assert there == [i * 1_000_000 for i in range(1, 101)]
         assert set(here) <= set(there)
     devices.clock.sleep(0.01)  # the host outlives its guests
-
-
-def test_a_host_of_another_station_file_is_refused(devices: Devices, config: StationConfig) -> None:
-    other = config.model_copy(update={"world": config.world.model_copy(update={"timestep": 0.0005})})  # type: ignore
-    with pytest.raises(NotConnected, match=r"another world\.timestep"), Station(other).connect():
-        pass
-
-
-def test_a_host_takes_profile_and_stiffness_from_the_run_that_joins(devices: Devices, config: StationConfig) -> None:
-    softer = config.model_copy(update={"world": config.world.model_copy(update={"stiffness_scale": 0.5})})  # type: ignore
-    with Station(softer).connect() as joined:
-        assert joined.simulation is not None and softer.world is not None
-        sags = []
-        for world in (config.world, softer.world):
-            joined.simulation.reset(0, scene(), world.model_dump())  # type: ignore[union-attr]
-            truth = joined.simulation.truth()
-            sags.append(truth.ee[1] - truth.go[1])
-        assert sags[1] - sags[0] == pytest.approx(MASS * 9.81 / 2000.0, rel=1e-3)  # half the stiffness, twice the sag
 
 
 def test_a_new_grasp_over_the_bus_is_that_of_the_seed_and_the_trial(devices: Devices, config: StationConfig) -> None:
@@ -375,41 +187,6 @@ def test_dropouts_are_counted_by_who_receives_over_the_bus(devices: Devices, tmp
     received = [reading.stamp.sequence for reading in wrist.since(-1)]
     assert wrist.gaps == received[-1] - received[0] + 1 - len(received) > 10
     assert devices.arm.gaps == 0
-
-
-def test_a_foreign_program_at_the_endpoint_is_told(config: StationConfig) -> None:
-    port = int(config.bus.endpoint.rsplit(":", 1)[1])
-    config = config.model_copy(update={"bus": config.bus.model_copy(update={"timeout": 1.0})})
-    with socket.socket() as mute:
-        mute.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        mute.bind(("127.0.0.1", port))
-        mute.listen()
-        start = time.monotonic()
-        with pytest.raises(NotConnected, match="another program"), Station(config).connect():
-            pass
-        assert time.monotonic() - start < 5.0
-
-
-def test_a_bus_without_the_station_is_told(config: StationConfig) -> None:
-    config = config.model_copy(update={"bus": config.bus.model_copy(update={"timeout": 1.0})})
-    with (
-        Bus(config.bus.endpoint, listen=True, shared_memory=False),
-        pytest.raises(NotConnected, match="does not serve station 'sim'"),
-        Station(config).connect(),
-    ):
-        pass
-
-
-def test_a_host_that_cannot_start_says_why(config: StationConfig) -> None:
-    second_arm = station(other_arm={"kind": "arm"})
-    with pytest.raises(NotConnected, match="one arm"), Station(second_arm).connect():
-        pass
-
-
-def test_a_lab_station_is_not_started_from_here() -> None:
-    config = station().model_copy(update={"world": None})
-    with pytest.raises(NotConnected, match="extrinsic serve"), Station(config).connect():
-        pass
 
 
 def test_all_devices_that_fail_to_open_are_told_in_one_tree(devices: Devices, config: StationConfig) -> None:
@@ -454,14 +231,6 @@ def test_in_real_time_the_world_keeps_the_pace_of_the_wall() -> None:
             devices.clock.sleep(0.1)
         with devices.arm.lease("test"):
             devices.arm.command(ArmTarget(np.array([0.0, 0.21, 0.0]), np.zeros(3), 0.1))
-
-
-def test_in_real_time_a_sleep_ends_when_the_host_dies() -> None:
-    with Station(station("realtime")).connect() as devices:
-        assert devices.host is not None
-        os.kill(devices.host.pid, signal.SIGKILL)
-        with pytest.raises(DeviceFault, match="died"):
-            devices.clock.sleep(20.0)
 
 
 def test_a_camera_renders_when_asked_and_the_picture_is_logged(tmp_path: Path) -> None:
