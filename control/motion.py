@@ -77,6 +77,10 @@ class Mover:
         seconds = max(0.2, float(np.hypot(step[0], step[1])) / self.speed, abs(float(se2.wrap(step[2]))) / np.pi * 3)
         self.ramp(goal, seconds)
 
+    def follow(self, pose: Array, twist: Array) -> None:
+        """One set-point of a path that the caller makes up: ``pose`` (3,) and ``twist`` (3,), one period from now."""
+        self._send(np.asarray(pose, float), np.asarray(twist, float))
+
     def rest(self, seconds: float) -> None:
         """Stay for ``seconds``, repeating the set-point so that no watchdog mistakes a pause for a dead commander."""
         for _ in range(max(1, round(seconds / self._period))):

@@ -8,8 +8,10 @@ from typing import NoReturn
 import numpy as np
 
 from drivers.errors import DeviceFault, DeviceTimeout
-from drivers.interfaces import Arm, ForceTorqueSensor, TagCamera
+from drivers.interfaces import Arm, ForceTorqueSensor, TactileSensor, TagCamera
 from estimation.force_torque import FreeAirLoad, WristSensor, mean_wrench
+from estimation.state import StateEstimator
+from estimation.tactile_pose import TactilePoseEstimator, fuse
 from estimation.tag_pose import TagPose, estimate_planar_pose
 from mechanics import se2
 from mechanics.camera import CameraModel, TagGeometry
@@ -17,12 +19,21 @@ from mechanics.readings import Array, Status, TagDetection
 from mechanics.records import PlanarState
 
 
+@dataclass(frozen=True)
+class Finger:
+    """A tactile finger and the method that reads its pictures."""
+
+    sensor: TactileSensor
+    method: TactilePoseEstimator
+
+
 @dataclass
 class Observer:
     """Reads the devices and turns readings into poses and wrenches in W. Never sees the plant's truth.
 
     ``tags`` maps a body (``table``, ``go``, ``eo``) to the tags it carries; ``grasp`` is X_go_gocf; ``window_ns`` is
-    how far back wrench readings are averaged.
+    how far back wrench readings are averaged. With ``fingers`` and a ``state`` estimator of this grasp, `estimate`
+    learns the go's pose from ``tactile_frames`` pictures of each finger, and never from its tag.
     """
 
     arm: Arm
@@ -34,6 +45,10 @@ class Observer:
     grasp: Array
     window_ns: int
     frames: int = 1
+    fingers: tuple[Finger, ...] = ()
+    state: StateEstimator | None = None
+    tactile_frames: int = 1
+    _heard_ns: int = -1
 
     def see(self, bodies: tuple[str, ...]) -> dict[str, TagPose | None]:
         """Poses in W of the named bodies from fresh camera frames; None where none of its tags was seen."""
@@ -77,10 +92,41 @@ class Observer:
         wrench = self.wrist_sensor.wrench_on_go(reading, ee, grasp_centre[:2])
         return PlanarState(ee, go, eo, wrench)
 
+    def estimate(self) -> PlanarState:
+        """What controllers act on, at this instant: from the fingers and the elasticity where there are fingers.
+
+        Raises DeviceFault where no finger has seen the object since the grasp.
+        """
+        if self.state is None or not self.fingers:
+            return self.measure()
+        for _ in range(self.tactile_frames):
+            self._feel(self.state)
+        extrinsic = self.see(("eo",))["eo"] if self.tags.get("eo") else None
+        now = self.state.state()
+        return PlanarState(now.ee, now.go, None if extrinsic is None else extrinsic.pose, now.wrench)
+
+    def _feel(self, state: StateEstimator) -> None:
+        """Take in one picture of each finger, and what arm and wrist have said until then."""
+        pictures = [finger.sensor.capture() for finger in self.fingers]
+        readings = [*self.arm.since(self._heard_ns), self.arm.latest()]
+        for pose in readings:
+            state.push_pose(pose)
+        wrenches = self.wrist.since(self._heard_ns)
+        for wrench in wrenches:
+            state.push_wrench(wrench)
+        heard = [r.stamp.capture_ns for r in (*readings, *wrenches)]
+        self._heard_ns = max([self._heard_ns, *heard])
+        at = pictures[0].stamp.capture_ns
+        prior = state.expected(at)
+        found = fuse(prior, [f.method.estimate(image, prior) for f, image in zip(self.fingers, pictures, strict=True)])
+        state.push_tactile(at, prior, found)
+
     def zero(self, load: FreeAirLoad, X_W_go: Array) -> None:
         """Take the wrist sensor's offset in free air, with the go at ``X_W_go`` and only its weight on the sensor."""
         ee = self.arm_pose()
         self.wrist_sensor = self.wrist_sensor.zeroed(self.mean_reading(), ee, X_W_go, self.grasp, load)
+        if self.state is not None:
+            self.state.wrist = self.wrist_sensor
 
 
 def _distrust(device: str, asked: str, status: Status) -> NoReturn:

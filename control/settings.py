@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 
@@ -16,6 +18,10 @@ class TrialSettings(BaseModel):
     settle_timeout: float = Field(default=2.0, gt=0, le=60, description="longest wait for the wrench to rest [s]")
     settle_force: float = Field(default=0.01, gt=0, description="change of the mean from window to window [N]")
     window: float = Field(default=0.1, gt=0, le=2, description="averaging window of the wrench [s]")
+    go_pose: Literal["tags", "tactile"] = Field(
+        default="tags", description="where controllers learn the grasped object's pose from"
+    )
+    tactile_frames: int = Field(default=2, ge=1, le=30, description="pictures of each finger for an estimate")
     tag_frames: int = Field(default=1, ge=1, le=100, description="camera frames averaged per measurement")
     corrections: int = Field(default=1, ge=0, le=10, description="feedback updates at a waypoint before it is recorded")
     air_corrections: int = Field(default=3, ge=0, le=20, description="pose updates in free air before touch-down")

@@ -129,9 +129,11 @@ class Trial:
         steps = len(plan.ee)
         for k in range(steps):
             self._watch.phase("trajectory", k / steps)
-            measured, commanded = self._visit(controller, plan, k)
+            measured, commanded, estimated = self._visit(controller, plan, k)
             planned = PlanarState(plan.ee[k], plan.go[k], None if plan.eo is None else plan.eo[k], plan.wrench[k])
-            record = WaypointRecord(self._clock.now_ns(), self._name, k, planned, commanded, measured)
+            record = WaypointRecord(
+                self._clock.now_ns(), self._name, k, planned, commanded, measured, estimated=estimated
+            )
             self._result.waypoints.append(record)
             self._watch.waypoint(record)
             deviation = monitor.check(k, measured, weight)
@@ -144,21 +146,22 @@ class Trial:
         self._leave()
         self._watch.phase("done", 1.0)
 
-    def _visit(self, controller: Controller, plan: Plan, k: int) -> tuple[PlanarState, Array]:
+    def _visit(self, controller: Controller, plan: Plan, k: int) -> tuple[PlanarState, Array, PlanarState | None]:
         """Go to waypoint ``k``, let the controller correct it, and measure once settled."""
         s, mover = self._settings, self._mover
         mover.ramp(controller.command(plan.go[k], plan.ee[k]), s.ramp)
         self._settle()
         for _ in range(s.corrections if controller.feedback else 0):
-            controller.in_contact(plan.go[k], plan.wrench[k], self._observer.measure())
+            controller.in_contact(plan.go[k], plan.wrench[k], self._observer.estimate())
             mover.ramp(controller.command(plan.go[k], plan.ee[k]), s.ramp)
             self._settle()
-        return self._observer.measure(), mover.pose
+        estimated = self._observer.estimate() if self._observer.fingers and controller.feedback else None
+        return self._observer.measure(), mover.pose, estimated
 
     def _converge_in_air(self, controller: Controller, go: Array, ee: Array) -> None:
         for _ in range(self._settings.air_corrections):
             before = controller.correction
-            controller.in_air(go, self._observer.measure())
+            controller.in_air(go, self._observer.estimate())
             self._mover.travel(controller.command(go, ee))
             self._settle()
             if np.hypot(*(controller.correction - before)[:2]) < 2e-5:

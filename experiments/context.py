@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
+from control.observe import Finger
 from control.settings import TrialSettings
 from drivers.station import Devices, Station
 from drivers.wire.log import LogWriter
@@ -53,6 +54,7 @@ class RunContext:
         self.ask, self.check_interrupt = ask, check_interrupt
         self._closing = closing
         self._devices: Devices | None = None
+        self._fingers: tuple[Finger, ...] | None = None
 
     def devices(self) -> Devices:
         """The station's devices, opened and logged at the first call; a simulated world is reset to the scene."""
@@ -70,6 +72,16 @@ class RunContext:
                 devices.clock.sleep(WARM_UP)
             self._devices = devices
         return self._devices
+
+    def fingers(self) -> tuple[Finger, ...]:
+        """The tactile fingers, where controllers are to feel; they are made ready at the first call."""
+        if self.settings.go_pose != "tactile":
+            return ()
+        if self._fingers is None:
+            from experiments.fingers import fingers
+
+            self._fingers = fingers(self.resolved, self.devices())
+        return self._fingers
 
     @property
     def believed(self) -> setup.Believed:

@@ -6,16 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from control.observe import Observer
+from control.observe import Finger, Observer
 from control.settings import TrialSettings
 from drivers.scene import Body, Scene, TagMount
 from drivers.station import Devices
+from estimation.contact_location import ContactLocator
 from estimation.force_torque import FreeAirLoad, WristSensor
+from estimation.grasp_filter import GraspFilter
+from estimation.state import StateEstimator
 from experiments import registries
-from experiments.calibrate.models import CameraCalibration, ForceTorqueCalibration
+from experiments.calibrate.models import CameraCalibration, ClockCalibration, ForceTorqueCalibration
 from experiments.calibrate.store import Calibrations
 from experiments.files import Resolved
-from experiments.schema import PlanStage
+from experiments.schema import ExecuteStage, PlanStage
 from mechanics import se2
 from mechanics.camera import CameraModel, TagGeometry
 from mechanics.elasticity import Elasticity
@@ -47,7 +50,21 @@ def _geometry(mount: TagMount) -> TagGeometry:
 
 
 def scene(resolved: Resolved) -> Scene:
-    """The initial scene: the grasped object upright in the fingers, clear of the table."""
+    """The initial scene. An experiment that only calibrates begins with nothing on the table."""
+    whole = every_body(resolved)
+    if any(isinstance(stage, PlanStage | ExecuteStage) for stage in resolved.experiment.stages):
+        return whole
+    return without_extrinsic(whole)
+
+
+def without_extrinsic(scene: Scene) -> Scene:
+    """The scene with the grasped object alone."""
+    friction = {"go-ground": scene.friction["go-ground"]}
+    return scene.model_copy(update={"extrinsic": None, "extrinsic_pose": None, "friction": friction})
+
+
+def every_body(resolved: Resolved) -> Scene:
+    """The grasped object upright in the fingers, clear of the table, and the extrinsic one, nobody says where."""
     lowest = float(resolved.grasped.polygon.vertices[:, 1].min())
     upright = np.array([0.0, START_HEIGHT - lowest, 0.0])
     carried = free_air_load(resolved).wrench_on_go(upright, se2.compose(upright, resolved.grasp)[:2])
@@ -74,7 +91,8 @@ class Believed:
     """What planner, controllers and estimators take for true: as calibrated, else as catalogue and station say.
 
     ``stiffness`` (3, 3) K in gocf, ``friction`` by pair, ``tool`` mass [kg] and centre (2,) in ee [m], ``camera``, and
-    the ``tags`` of each body: ``table``, ``go``, ``eo``. None: as the device describes it.
+    the ``tags`` of each body: ``table``, ``go``, ``eo``. None: as the device describes it. ``delays`` [s] of the streams
+    behind the arm's.
     """
 
     stiffness: Array
@@ -82,6 +100,7 @@ class Believed:
     tool: tuple[float, Array] | None
     camera: CameraModel | None
     tags: dict[str, tuple[TagGeometry, ...]]
+    delays: dict[str, float]
 
 
 def believed(resolved: Resolved, calibrations: Calibrations) -> Believed:
@@ -90,6 +109,7 @@ def believed(resolved: Resolved, calibrations: Calibrations) -> Believed:
     hung = calibrations.of(ForceTorqueCalibration)
     camera = calibrations.of(CameraCalibration)
     seat = calibrations.tag(resolved)
+    clock = calibrations.of(ClockCalibration)
     seen = tags(resolved)
     if seat is not None:
         seen["go"] = tuple(replace(tag, pose=seat.pose) if tag.id == seat.id else tag for tag in seen["go"])
@@ -99,26 +119,41 @@ def believed(resolved: Resolved, calibrations: Calibrations) -> Believed:
         None if hung is None else (hung.tool_mass, np.array(hung.tool_centre)),
         None if camera is None else camera.model,
         seen,
+        {} if clock is None else {name: found.delay for name, found in clock.delays.items()},
     )
 
 
-def observer(resolved: Resolved, devices: Devices, settings: TrialSettings, known: Believed) -> Observer:
-    """The eyes of a trial: arm, wrist sensor and camera, with what is known of them."""
+def observer(
+    resolved: Resolved, devices: Devices, settings: TrialSettings, known: Believed, fingers: tuple[Finger, ...] = ()
+) -> Observer:
+    """The eyes of a trial: arm, wrist sensor, camera and ``fingers``, with what is known of them and a fresh grasp."""
     wrist = devices.force_torque("wrist")
     said = wrist.describe().extra
     tool = said.get("tool", {"mass": 0.0, "centre": (0.0, 0.0)})
     mass, centre = known.tool or (tool["mass"], np.array(tool["centre"], float))
     camera = known.camera or CameraModel.from_dict(devices.camera.describe().extra["camera"])
+    wrist_sensor = WristSensor(np.array(said["pose"], float), np.zeros(3), mass, centre, GRAVITY)
     return Observer(
         arm=devices.arm,
         wrist=wrist,
         camera=devices.camera,
         camera_model=camera,
         tags=known.tags,
-        wrist_sensor=WristSensor(np.array(said["pose"], float), np.zeros(3), mass, centre, GRAVITY),
+        wrist_sensor=wrist_sensor,
         grasp=resolved.grasp,
         window_ns=round(settings.window * 1e9),
         frames=settings.tag_frames,
+        fingers=fingers,
+        state=StateEstimator(
+            GraspFilter(resolved.grasp),
+            Elasticity(known.stiffness),
+            wrist_sensor,
+            free_air_load(resolved),
+            settings.window,
+            delays=known.delays,
+            locator=ContactLocator(resolved.grasped.polygon, max(known.friction.values())),
+        ),
+        tactile_frames=settings.tactile_frames,
     )
 
 

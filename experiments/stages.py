@@ -83,7 +83,7 @@ def _one_trial(
         try:
             if devices.simulation is not None:
                 devices.simulation.regrasp(trial)
-            observer = setup.observer(context.resolved, devices, context.settings, context.believed)
+            observer = setup.observer(context.resolved, devices, context.settings, context.believed, context.fingers())
             result = Trial(name, plan, controller, observer, clock, load, context.settings, watch).run()
         except SimulationDiverged as error:
             result = TrialResult("diverged", str(error), plan)

@@ -24,7 +24,8 @@ class PlanarState:
 class WaypointRecord:
     """One settled waypoint of a trial: planned (anchored to the table), commanded ee pose, measured, and true.
 
-    ``truth`` is the plant's own state, filled in by the runner in simulation only.
+    ``estimated`` is what the controller was told of this instant, where it asks for more than what is measured (from
+    the tactile images, say). ``truth`` is the plant's own state, filled in by the runner in simulation only.
     """
 
     capture_ns: int
@@ -34,6 +35,7 @@ class WaypointRecord:
     commanded: Array
     measured: PlanarState
     truth: PlanarState | None = None
+    estimated: PlanarState | None = None
 
 
 @dataclass(frozen=True, slots=True)

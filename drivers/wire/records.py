@@ -28,7 +28,7 @@ def encode_record(record: Record) -> bytes:
     """The record as CDR of its type in `STREAMS`."""
     header = messages.header(record.capture_ns, "world")
     if isinstance(record, WaypointRecord):
-        truth = record.truth
+        truth, estimate = record.truth, record.estimated
         fields: dict[str, Any] = {
             "trial": record.trial,
             "step": record.step,
@@ -37,6 +37,8 @@ def encode_record(record: Record) -> bytes:
             "measured": _state(record.measured),
             "has_truth": truth is not None,
             "truth": _state(record.measured if truth is None else truth),
+            "has_estimate": estimate is not None,
+            "estimated": _state(record.measured if estimate is None else estimate),
         }
     else:
         fields = {name: getattr(record, name) for name in record.__dataclass_fields__ if name != "capture_ns"}
@@ -60,6 +62,7 @@ def decode_record(type_name: str, payload: bytes) -> Record:
             value.commanded.copy(),
             _planar(value.measured),
             _planar(value.truth) if value.has_truth else None,
+            _planar(value.estimated) if value.has_estimate else None,
         )
     names = [name for name in kind.__dataclass_fields__ if name != "capture_ns"]
     return kind(capture_ns, *(getattr(value, name) for name in names))

@@ -12,25 +12,31 @@ import numpy as np
 
 from drivers.errors import DeviceFault
 from estimation.contact_wrench import wrist_covariance
+from estimation.finger_memory import Path
 from experiments import setup
 from experiments.calibrate.rig import Rig
 from experiments.calibrate.schema import ElasticityStage
 from mechanics import se2, wrench
-from mechanics.readings import Array
+from mechanics.readings import Array, Status
 from mechanics.task_plane import TaskPlane
 
 #: how often the fixed object is looked at
 LOOKS = 20
+#: time over which a sample's wrench is averaged [s]
+AVERAGED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class ElasticitySamples:
     """What was measured: ``x`` (n, 3) displacements of ee in gocf [m, m, rad], ``w`` (n, 3) wrenches of the sensor on
-    the object about the grasp centre, in gocf [N, N, N·m], and the covariance (3, 3) of each row of ``w``."""
+    the object about the grasp centre, in gocf [N, N, N·m], each with ``w_covariance`` (3, 3), at ``times`` (n,) [s];
+    and the ``path`` that the fingers went from the grasp on."""
 
     x: Array
     w: Array
     w_covariance: Array
+    times: Array
+    path: Path
 
 
 def schedule(stage: ElasticityStage, stiffness: Array, rng: np.random.Generator) -> Array:
@@ -54,6 +60,7 @@ def sampled(rig: Rig, stage: ElasticityStage, rng: np.random.Generator) -> Elast
     """Go through the schedule and measure. Ends with the object free in the fingers again."""
     context, observer = rig.context, rig.observer
     what = context.resolved.grasped.name
+    began = rig.devices.clock.now_ns()
     rig.regrasp(0)
     seen = observer.see(("go",))["go"]
     if seen is None:
@@ -61,13 +68,17 @@ def sampled(rig: Rig, stage: ElasticityStage, rng: np.random.Generator) -> Elast
     observer.zero(setup.free_air_load(context.resolved), seen.pose)
     rig.clamp("go", what)
     X_W_gocf = se2.compose(_looked(rig), observer.grasp)
-    x, w, covariances = [], [], []
+    x, w, covariances, times = [], [], [], []
+    trace = _Trace(rig, began)
     targets = schedule(stage, context.believed.stiffness, rng)
     with context.progress.steps("elasticity samples", len(targets)) as advance:
         for target in targets:
             rig.mover.ramp(se2.compose(X_W_gocf, target), stage.ramp)
-            reading, covariance = rig.wrist_samples(stage.dwell)
+            rig.rest(stage.dwell)
+            reading, covariance = rig.wrist_samples(AVERAGED)
+            times.append(rig.devices.clock.now_ns() * 1e-9 - AVERAGED / 2)
             ee = observer.arm_pose()
+            trace.follow()
             x.append(se2.between(X_W_gocf, ee))
             on_go = observer.wrist_sensor.wrench_on_go(reading, ee, X_W_gocf[:2])
             w.append(wrench.rotated(on_go, -X_W_gocf[2]))
@@ -76,7 +87,31 @@ def sampled(rig: Rig, stage: ElasticityStage, rng: np.random.Generator) -> Elast
     rig.mover.ramp(se2.compose(X_W_gocf, np.zeros(3)), 0.5)
     rig.free(what)
     rig.rest(0.5)
-    return ElasticitySamples(np.array(x), np.array(w), np.mean(covariances, axis=0))
+    path = trace.path(X_W_gocf)
+    return ElasticitySamples(np.array(x), np.array(w), np.mean(covariances, axis=0), np.array(times), path)
+
+
+class _Trace:
+    """Where the arm has been since the grasp, by its own readings."""
+
+    def __init__(self, rig: Rig, since_ns: int):
+        self._arm, self._last = rig.devices.arm, since_ns
+        self._times: list[float] = []
+        self._poses: list[Array] = []
+        self.follow()
+
+    def follow(self) -> None:
+        """Take in the readings since the last call; a device keeps the newest only."""
+        for reading in self._arm.since(self._last):
+            self._last = reading.stamp.capture_ns
+            if reading.stamp.status is Status.OK:
+                self._times.append(self._last * 1e-9)
+                self._poses.append(reading.pose)
+
+    def path(self, X_W_gocf: Array) -> Path:
+        """The whole way, as displacements in gocf."""
+        poses = np.array(self._poses)
+        return Path(np.array(self._times), se2.between(np.broadcast_to(X_W_gocf, poses.shape), poses))
 
 
 def _looked(rig: Rig) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+
 import numpy as np
 
 from control.motion import Mover
@@ -49,7 +50,7 @@ class Rig:
             self.mover.travel(np.asarray(pose, float))
         self.rest(0.2)
 
-    # -- what a person does, or the simulated world ---------------------------------------------------------------------
+    # -- what a person does, or the simulated world ------------------------------------------------------------------
 
     def regrasp(self, number: int) -> None:
         """Take the object into the fingers anew; a person is asked to."""
