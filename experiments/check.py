@@ -92,6 +92,11 @@ def _device_problems(resolved: Resolved) -> list[Problem]:
     ]
     if not any(isinstance(d, ForceTorqueConfig) and d.mount == "wrist" for d in station.devices.values()):
         problems.append(document.problem(("devices",), "the station has no force_torque on the wrist", "mount: wrist"))
+    under = any(isinstance(d, ForceTorqueConfig) and d.mount == "table" for d in station.devices.values())
+    for i, stage in enumerate(resolved.experiment.stages):
+        if isinstance(stage, FrictionStage) and not under:
+            wrong = "the station has no force_torque under the table, which measures the contact force"
+            problems.append(resolved.experiment_document.problem(("stages", i), wrong, "a device with mount: table"))
     if not station.table_tags:
         problems.append(document.problem(("table_tags",), "the table has no tags", "at least one tag"))
     if resolved.grasped.tag is None:

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from drivers.errors import CommandRefused, DriverError
 from drivers.wire.log import LogWriter
+from estimation.errors import FitError
 from experiments.calibrate import store
 from experiments.calibrate.store import Calibrations
 from experiments.check import check
@@ -103,6 +104,8 @@ def _stages(
                     break
         except InfeasiblePlan as error:
             code, reason = ExitCode.INFEASIBLE, str(error)
+        except FitError as error:
+            code, reason = ExitCode.FELL_SHORT, f"the calibration found no answer: {error}"
         except CommandRefused as error:
             code, reason = ExitCode.DEVICE_FAILED, str(error)
         except DriverError as error:
@@ -110,7 +113,7 @@ def _stages(
         except KeyboardInterrupt:
             code, reason = ExitCode.INTERRUPTED, INTERRUPTED
         interrupt.closing()
-        if code in (ExitCode.INFEASIBLE, ExitCode.INTERRUPTED, ExitCode.DEVICE_FAILED):
+        if code in (ExitCode.FELL_SHORT, ExitCode.INFEASIBLE, ExitCode.INTERRUPTED, ExitCode.DEVICE_FAILED):
             context.event("error", reason)
         results["health"] = _health(context)
         results["log"] = _accounts(context, log)

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from typing import Any
 
 from control.base import Controller
@@ -124,4 +125,19 @@ def _row(
     }
 
 
-STAGES: dict[str, Callable[[RunContext, Any], None]] = {"plan": plan_stage, "execute": execute_stage}
+def _calibration(module: str) -> Callable[[RunContext, Any], None]:
+    """The stage ``<module>_stage`` of ``experiments.calibrate.<module>``, imported when it runs: its fits are heavy."""
+
+    def run(context: RunContext, stage: Any) -> None:
+        getattr(import_module(f"experiments.calibrate.{module}"), f"{module}_stage")(context, stage)
+
+    return run
+
+
+_CALIBRATIONS = ("force_torque", "elasticity", "friction", "camera", "clock")
+
+STAGES: dict[str, Callable[[RunContext, Any], None]] = {
+    "plan": plan_stage,
+    "execute": execute_stage,
+    **{f"calibrate_{name}": _calibration(name) for name in _CALIBRATIONS},
+}

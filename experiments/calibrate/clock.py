@@ -70,8 +70,7 @@ def _swung(rig: Rig, stage: ClockStage) -> dict[str, tuple[Array, Array]]:
         for i in range(1, ticks + 1):
             t = i * period
             speed = (angle(t + 1e-4) - angle(t - 1e-4)) / 2e-4
-            mover.follow(at + [0.0, 0.0, angle(t)], np.array([0.0, 0.0, speed]))
-            # an odd number of ticks, so that the frames fall on every phase of the motion
+            mover.follow(at + angle(t) * np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, speed]))
             frames = [devices.camera.capture()] if devices.clock.lockstep and i % 3 == 0 else []
             if not devices.clock.lockstep:
                 frames = devices.camera.since(last_frame)

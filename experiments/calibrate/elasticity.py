@@ -12,10 +12,15 @@ import numpy as np
 
 from drivers.errors import DeviceFault
 from estimation.contact_wrench import wrist_covariance
+from estimation.elasticity_fit import fit_elasticity
 from estimation.finger_memory import Path
 from experiments import setup
-from experiments.calibrate.rig import Rig
+from experiments.calibrate import store
+from experiments.calibrate.models import ElasticityCalibration
+from experiments.calibrate.rig import Rig, at_hand
+from experiments.calibrate.samples import save_samples
 from experiments.calibrate.schema import ElasticityStage
+from experiments.context import RunContext
 from mechanics import se2, wrench
 from mechanics.readings import Array, Status
 from mechanics.task_plane import TaskPlane
@@ -24,6 +29,9 @@ from mechanics.task_plane import TaskPlane
 LOOKS = 20
 #: time over which a sample's wrench is averaged [s]
 AVERAGED = 0.1
+#: what a tare leaves of the wrist sensor's drift while the samples are taken, 1 sigma [N, N, N·m], and the order of
+#: the polynomial in time that it may follow
+DRIFT, DRIFT_ORDER = (0.02, 0.02, 0.004), 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +45,55 @@ class ElasticitySamples:
     w_covariance: Array
     times: Array
     path: Path
+
+
+def elasticity_stage(context: RunContext, stage: ElasticityStage) -> None:
+    """Identify K and keep it. Raises FitError where the samples do not tell."""
+    resolved = context.resolved
+    rng = np.random.default_rng([resolved.experiment.seed, 1])
+    with at_hand(context, f"the elasticity of {resolved.sensor.name}") as rig:
+        samples = sampled(rig, stage, rng)
+        rig.home()
+        devices = tuple(d.name for d in (rig.devices.arm, rig.devices.force_torque("wrist"), rig.devices.camera))
+    with context.progress.step("fit the elasticity"):
+        drifting = samples.w_covariance + np.diag(DRIFT) ** 2
+        fit = fit_elasticity(
+            samples.x, samples.w, w_covariance=drifting, times=samples.times, path=samples.path, drift_order=DRIFT_ORDER
+        )
+    amplitude = 0.5 * fit.reach
+    found = ElasticityCalibration(
+        origin=store.origin(resolved, devices, ("go",), context.folder.path.name),
+        sensor=resolved.sensor.name,
+        stiffness=_rows(fit.secant(amplitude)),
+        deviation=_rows(fit.secant_errors(amplitude)),
+        amplitude=amplitude,
+        initial=_rows(fit.stiffness),
+        stiffening=fit.stiffening,
+        hysteresis=fit.memory.hysteresis,
+        yield_length=fit.memory.yield_length,
+        creep=fit.memory.creep,
+        creep_time=fit.memory.creep_time,
+        offset=_three(fit.offset),
+        residual=_three(fit.residual_rms),
+        chi2=fit.chi2,
+        method=fit.method,
+        samples=fit.samples,
+    )
+    seen = samples.x - fit.offset  # to first order, what x is from gocf
+    columns = {**dict(zip(("x", "y", "theta"), seen.T, strict=True))}
+    columns |= dict(zip(("fx", "fy", "tau"), samples.w.T, strict=True))
+    columns |= dict(zip(("fx_fit", "fy_fit", "tau_fit"), fit.wrench(seen).T, strict=True))
+    save_samples(context, found.name, {"time": samples.times, **columns})
+    context.calibrated(found)
+
+
+def _three(values: Array) -> tuple[float, float, float]:
+    a, b, c = values.tolist()
+    return a, b, c
+
+
+def _rows(matrix: Array) -> tuple[tuple[float, float, float], ...]:
+    return tuple(_three(row) for row in matrix)
 
 
 def schedule(stage: ElasticityStage, stiffness: Array, rng: np.random.Generator) -> Array:

@@ -63,15 +63,25 @@ class _Calibration(_Model):
 class ElasticityCalibration(_Calibration):
     """The stiffness of a pair of fingers: w = K x, K in gocf (Tactile Elasticity Characterization).
 
-    ``stiffening`` [1/m] makes it w = K x (1 + stiffening · |x|), 0 where the data did not ask for it.
+    ``stiffness`` is what planner and controllers take: the secant at displacements of the size ``amplitude`` [m]. The
+    whole law at rest is w = K₀ (1 + stiffening · s) x, with ``initial`` K₀ and s the size of x (`finger_law`);
+    ``stiffening`` [1/m], ``hysteresis`` and ``creep`` (shares of K₀) are 0 where the data did not ask for them.
     """
 
     kind: Literal["elasticity"] = "elasticity"
     sensor: str
     stiffness: Matrix3 = Field(description="K [N/m, N, N·m/rad] in gocf")
     deviation: Matrix3 = Field(description="1 sigma of each entry")
+    amplitude: float = Field(ge=0)
+    initial: Matrix3
     stiffening: float = 0.0
-    residual: float = Field(ge=0, description="rms of the wrench's residual, relative")
+    hysteresis: float = 0.0
+    yield_length: float = 0.0
+    creep: float = 0.0
+    creep_time: float = 0.0
+    offset: Vector3 = Field(description="of the object in the fingers while it was calibrated, in gocf [m, m, rad]")
+    residual: Vector3 = Field(description="rms of the wrench's residual [N, N, N·m]")
+    chi2: float = Field(ge=0, description="misfit per degree of freedom")
     method: str
     samples: int = Field(ge=1)
 

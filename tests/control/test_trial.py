@@ -15,6 +15,7 @@ from drivers.errors import DeviceFault
 from drivers.sim.world import World
 from estimation.force_torque import FreeAirLoad, WristSensor
 from experiments import setup
+from experiments.calibrate.store import Calibrations
 from experiments.files import load
 from mechanics.camera import CameraModel
 from mechanics.records import WaypointRecord
@@ -37,7 +38,7 @@ class Station:
         self.arm = self.devices["arm"]
         self.arm.acquire("test")
         stage: Any = self.resolved.experiment.stages[0]
-        self.plan = make_plan(setup.task(self.resolved, stage), "press")
+        self.plan = make_plan(setup.task(self.resolved, stage, setup.believed(self.resolved, Calibrations())), "press")
         self.events: list[tuple[str, str]] = []
         self.phases: list[str] = []
         self.waypoints: list[WaypointRecord] = []
