@@ -26,7 +26,7 @@ from experiments.progress import Progress
 from experiments.provenance import provenance
 from experiments.report.build import build_report
 from experiments.run_folder import RunFolder, write_atomic, write_json
-from experiments.stages import STAGES
+from experiments.stages import STAGES, has_diverged, skip_stages
 from planning.errors import InfeasiblePlan
 
 INTERRUPTED = "interrupted by the user"
@@ -62,6 +62,7 @@ def run(resolved: Resolved, out: Path | None = None, console: Console | None = N
         "calibration": calibrations.told(),
         "plans": [],
         "trials": [],
+        "not_run": [],
         "tables": [],
         "timing": {"execute_wall_s": 0.0, "execute_station_s": 0.0},
     }
@@ -96,16 +97,18 @@ def _stages(
         context = RunContext(resolved, calibrations, folder, results, log, progress, closing, ask, heed)
         context.save()
         try:
-            for stage in resolved.experiment.stages:
+            for done, stage in enumerate(resolved.experiment.stages, 1):
                 STAGES[stage.stage](context, stage)
                 interrupt.check()
                 code, reason = of_trials(results["trials"])
-                if code in (ExitCode.DEVICE_FAILED, ExitCode.STOPPED):
+                if code in (ExitCode.DEVICE_FAILED, ExitCode.STOPPED) or has_diverged(results["trials"]):
+                    skip_stages(context, resolved.experiment.stages[done:])
                     break
         except InfeasiblePlan as error:
             code, reason = ExitCode.INFEASIBLE, str(error)
         except FitError as error:
             code, reason = ExitCode.FELL_SHORT, f"the calibration found no answer: {error}"
+            context.event("error", reason)
         except CommandRefused as error:
             code, reason = ExitCode.DEVICE_FAILED, str(error)
         except DriverError as error:
@@ -113,7 +116,7 @@ def _stages(
         except KeyboardInterrupt:
             code, reason = ExitCode.INTERRUPTED, INTERRUPTED
         interrupt.closing()
-        if code in (ExitCode.FELL_SHORT, ExitCode.INFEASIBLE, ExitCode.INTERRUPTED, ExitCode.DEVICE_FAILED):
+        if code in (ExitCode.INFEASIBLE, ExitCode.INTERRUPTED, ExitCode.DEVICE_FAILED):
             context.event("error", reason)
         results["health"] = _health(context)
         results["log"] = _accounts(context, log)

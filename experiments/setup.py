@@ -91,8 +91,8 @@ class Believed:
     """What planner, controllers and estimators take for true: as calibrated, else as catalogue and station say.
 
     ``stiffness`` (3, 3) K in gocf, ``friction`` by pair, ``tool`` mass [kg] and centre (2,) in ee [m], ``camera``, and
-    the ``tags`` of each body: ``table``, ``go``, ``eo``. None: as the device describes it. ``delays`` [s] of the streams
-    behind the arm's.
+    the ``tags`` of each body: ``table``, ``go``, ``eo``. None: as the device describes it. ``delays`` [s] of the
+    streams behind the arm's.
     """
 
     stiffness: Array

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from importlib import import_module
 from typing import Any
@@ -16,7 +16,7 @@ from drivers.station import Devices
 from experiments import registries, setup
 from experiments.context import RunContext
 from experiments.metrics import errors_of
-from experiments.schema import ExecuteStage, PlanStage
+from experiments.schema import ExecuteStage, PlanStage, Stage
 from mechanics.records import PhaseRecord, PlanarState, TrialRecord, WaypointRecord
 from planning.plan import Plan
 
@@ -135,6 +135,25 @@ def _calibration(module: str) -> Callable[[RunContext, Any], None]:
 
 
 _CALIBRATIONS = ("force_torque", "elasticity", "friction", "camera", "clock")
+
+
+def has_diverged(trials: list[dict[str, Any]]) -> bool:
+    """Whether the simulated world is nonsense by now: it has diverged in a trial, and only a reset would mend it."""
+    return any(trial["status"] == "diverged" for trial in trials)
+
+
+def skip_stages(context: RunContext, stages: Sequence[Stage]) -> None:
+    """Note among the results which stages do not run any more, and why: how the last trial ended.
+
+    A reset within a run would mend a diverged world, but its stamps would begin at 0 again, and the log run backwards.
+    """
+    last = context.results["trials"][-1]
+    reason = f"{last['name']} ended as {last['status']}"
+    for stage in stages:
+        name = getattr(stage, "name", None) or getattr(stage, "plan", "")
+        context.results["not_run"].append({"stage": stage.stage, "name": name, "reason": reason})
+        context.event("warning", f"{f'{stage.stage} {name}'.strip()}: not run, for {reason}")
+
 
 STAGES: dict[str, Callable[[RunContext, Any], None]] = {
     "plan": plan_stage,

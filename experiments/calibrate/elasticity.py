@@ -16,7 +16,7 @@ from estimation.elasticity_fit import fit_elasticity
 from estimation.finger_memory import Path
 from experiments import setup
 from experiments.calibrate import store
-from experiments.calibrate.models import ElasticityCalibration
+from experiments.calibrate.models import ElasticityCalibration, Matrix3, Vector3
 from experiments.calibrate.rig import Rig, at_hand
 from experiments.calibrate.samples import save_samples
 from experiments.calibrate.schema import ElasticityStage
@@ -87,13 +87,13 @@ def elasticity_stage(context: RunContext, stage: ElasticityStage) -> None:
     context.calibrated(found)
 
 
-def _three(values: Array) -> tuple[float, float, float]:
+def _three(values: Array) -> Vector3:
     a, b, c = values.tolist()
     return a, b, c
 
 
-def _rows(matrix: Array) -> tuple[tuple[float, float, float], ...]:
-    return tuple(_three(row) for row in matrix)
+def _rows(matrix: Array) -> Matrix3:
+    return _three(matrix[0]), _three(matrix[1]), _three(matrix[2])
 
 
 def schedule(stage: ElasticityStage, stiffness: Array, rng: np.random.Generator) -> Array:

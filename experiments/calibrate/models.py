@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 from zlib import crc32
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from mechanics.camera import CameraModel
 from mechanics.catalogue import ObjectModel
@@ -29,6 +29,17 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+def _instant(value: Any) -> Any:
+    """ISO 8601 text, with its zone, as the instant that it names."""
+    if not isinstance(value, str):
+        return value
+    try:
+        instant = datetime.fromisoformat(value)
+    except ValueError:
+        raise Refusal(f"{value!r} is no instant", "ISO 8601, such as 2026-01-31T12:00:00Z") from None
+    return instant if instant.tzinfo is not None else instant.replace(tzinfo=UTC)
+
+
 class Origin(_Model):
     """Of what, when and by what a calibration was made.
 
@@ -36,7 +47,7 @@ class Origin(_Model):
     (see `fingerprint`).
     """
 
-    made: datetime
+    made: Annotated[datetime, BeforeValidator(_instant)]
     station: str
     world: dict[str, Any] | None = None
     devices: dict[str, str] = Field(default_factory=dict)
