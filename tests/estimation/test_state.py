@@ -181,7 +181,8 @@ def test_the_covariance_is_that_of_the_errors_over_many_grasps() -> None:
         scale = np.array(made.grasp.noise.prior)
         q = scale * rng.standard_normal(3)
         held = Held(tuple(q))
-        feed(made, held, 200 * MS, EE, np.zeros(3))
+        made.push_pose(pose(200 * MS, EE))
+        made.push_wrench(held.wrist(200 * MS, EE, np.zeros(3)))
         information = np.diag(np.array([3e-4, 1e-3, np.radians(0.5)]) ** -2)
         at, prior = 200 * MS, made.expected(200 * MS)
         noisy = se2.compose(
