@@ -16,14 +16,19 @@ FaultKind = Literal["drop", "freeze", "stuck", "delay", "bias", "saturate", "gar
 #: faults that mean something only for some kinds of device
 SUITED: Mapping[str, tuple[str, ...]] = {
     "bias": ("arm", "gripper", "force_torque"),
-    "saturate": ("force_torque",),
+    "saturate": ("force_torque", "tactile", "tag_camera"),
 }
 #: lowest and highest ``value`` of the faults that have one; None where it must be given, else its default
 _VALUES: Mapping[str, tuple[float, float, float | None, str]] = {
     "drop": (0.0, 1.0, None, "the share of readings that is lost, 0 to 1"),
     "delay": (0.0, 1e3, None, "by how much readings are late [s]"),
     "bias": (-inf, inf, None, "by how much the reading jumps, in its own unit"),
-    "saturate": (0.0, inf, None, "the largest number that still comes out, in the reading's own unit"),
+    "saturate": (
+        0.0,
+        inf,
+        None,
+        "the end of the range, in the reading's own unit; of a picture in grey levels, or in tenths of a millimetre",
+    ),
     "garbage": (0.0, 1.0, 1.0, "the share of messages that is damaged, 0 to 1"),
 }
 

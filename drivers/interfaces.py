@@ -392,6 +392,14 @@ class Simulation(Protocol):
         """
         ...
 
+    def show_board(self, board: dict | None, X_W_B: Array) -> None:
+        """Hold a board before the tag cameras at ``X_W_B`` (4, 4); None puts it away, as a reset does.
+
+        ``board`` is a `mechanics.tag_board.TagBoard` as a dict. It hides what is behind it, and nothing stands in
+        front of it. Raises CommandRefused for what is no board or no pose.
+        """
+        ...
+
     def inject(self, fault: Fault | dict) -> None:
         """Let a fault happen; its times count from now. A reset or `clear_faults` ends it.
 

@@ -26,6 +26,19 @@ def point_in_world(p_W: ArrayLike, height: ArrayLike = 0.0) -> Array:
     return np.asarray(p_W, float) @ _PLANE_AXES + np.asarray(height, float)[..., None] * _TOWARD_VIEWER
 
 
+def rigid(name: str, X_AB: ArrayLike) -> Array:
+    """The pose ``X_AB`` (4, 4) as float64. Raises ValueError, with its ``name``, for what is no rigid motion."""
+    X_AB = np.array(X_AB, float)
+    if X_AB.shape != (4, 4) or not np.isfinite(X_AB).all():
+        raise ValueError(f"{name}: expected 4 x 4 finite numbers, got {X_AB.tolist()}")
+    R = X_AB[:3, :3]
+    if not (np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0):
+        raise ValueError(f"{name}: expected a rotation in the upper left 3 x 3 block")
+    if not np.array_equal(X_AB[3], (0, 0, 0, 1)):
+        raise ValueError(f"{name}: expected last row (0, 0, 0, 1), got {X_AB[3].tolist()}")
+    return X_AB
+
+
 def tag_corners(size: float) -> Array:
     """Corners (4, 2) [m] of a tag of edge ``size`` in its own frame: (−,−), (+,−), (+,+), (−,+)."""
     return 0.5 * size * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
@@ -78,11 +91,7 @@ class CameraModel:
             raise ValueError(f"camera image: expected a positive size, got {self.width} x {self.height}")
         if not (self.K[0, 0] > 0 and self.K[1, 1] > 0 and np.array_equal(self.K[2], (0, 0, 1))):
             raise ValueError(f"camera K: expected positive focal lengths and last row (0, 0, 1), got {self.K.tolist()}")
-        R = self.X_WC[:3, :3]
-        if not (np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0):
-            raise ValueError("camera X_WC: expected a rotation in the upper left 3 x 3 block")
-        if not np.array_equal(self.X_WC[3], (0, 0, 0, 1)):
-            raise ValueError(f"camera X_WC: expected last row (0, 0, 0, 1), got {self.X_WC[3].tolist()}")
+        rigid("camera X_WC", self.X_WC)
 
     @classmethod
     def looking_at(

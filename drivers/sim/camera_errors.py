@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from drivers.sim.mismatch import CameraFigures
 from mechanics.camera import CameraModel
 from mechanics.readings import Array
+
+_STEPS = 2**16
+
+
+@cache
+def _quantiles() -> NDArray[np.float32]:
+    """The normal distribution in so many equal shares: drawn from, it costs a fifth of the exact one, up to 4.3 σ."""
+    return ndtri((np.arange(_STEPS) + 0.5) / _STEPS).astype(np.float32)
 
 
 def calibrated(pinhole: CameraModel, figures: CameraFigures) -> CameraModel:
@@ -40,7 +51,7 @@ def exposed(picture: Array, figures: CameraFigures, rng: np.random.Generator) ->
     if figures.exposure:
         levels *= 1 + figures.exposure * rng.standard_normal()
     if figures.noise:
-        grain = rng.standard_normal(levels.shape, np.float32)
+        grain = _quantiles().take(rng.integers(0, _STEPS, levels.shape, np.uint16), mode="clip")
         grain *= figures.noise
         levels += grain
     return np.asarray(cv2.convertScaleAbs(np.maximum(levels, 0)), np.uint8)  # rounds and saturates

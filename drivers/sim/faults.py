@@ -7,10 +7,13 @@
 | ``stuck`` | stamps advance, the value does not | `Status.STALE`, as far as the guards can tell |
 | ``delay`` | readings come ``value`` seconds late, with true stamps | the age; past `max_age` DeviceTimeout |
 | ``bias`` | every number of the reading jumps by ``value`` | `Status.INVALID`, as far as the guards can tell |
-| ``saturate`` | numbers beyond ±``value`` are clipped | `Status.SATURATED` |
+| ``saturate`` | numbers beyond ±``value`` are clipped, pictures overexposed | `Status.SATURATED` |
 | ``garbage`` | the share ``value`` of the messages is damaged | ProtocolError from `latest`, counted in `corrupt` |
 | ``disconnect`` | the device goes; after ``duration`` it is back | DeviceFault until it is closed and connected again |
 | ``crash`` | the process behind all devices dies | DeviceFault from all of them |
+
+A picture of which a grey level is beyond ``value`` is taken with so much light that ``value`` is white already; of a
+depth image the range ends at ``value`` tenths of a millimetre, and what lies behind is there.
 
 What no device can notice by itself needs a second witness. Undetectable here are: a noise-free stream that is stuck
 while nothing asks it to change; a force/torque jump below the guard's limits, or in the plane's own axes alone; a pose
@@ -38,6 +41,8 @@ R = TypeVar("R", bound=_Stamped)
 
 #: the next change when there is none [ns]
 NEVER = 2**63 - 1
+#: the end of a picture's grey levels
+WHITE = 255.0
 #: equal by chance so rarely that it is none: once in so many readings
 RARE = 1e12
 #: more equal readings than this are not waited for
@@ -106,12 +111,21 @@ class Line:
         return _with(reading, values, status)
 
     def picture(self, picture: NDArray) -> NDArray:
-        """The picture that comes out: the same over and over while it is stuck."""
+        """The picture that is taken: the same over and over while it is stuck."""
         if not self.stuck:
             return picture
         if self._picture is None:
             self._picture = picture
         return self._picture
+
+    def saturated(self, picture: NDArray) -> NDArray | None:
+        """What comes out of a picture that goes beyond the range; None where it does not."""
+        limit = None if self.limit is None else max(self.limit, 1.0)  # a depth of 0 is none
+        if limit is None or not (picture > limit).any():
+            return None
+        if picture.dtype == np.uint16:
+            return np.minimum(picture, np.uint16(limit))
+        return np.minimum(picture * (WHITE / limit), WHITE).astype(picture.dtype)
 
 
 class Faults:
@@ -205,9 +219,15 @@ class Faulty(Sensor[R]):
     # -- for sensors that are asked for a frame ------------------------------------------------------------------
 
     def _developed(self, picture: NDArray, noisy: bool) -> tuple[NDArray, Status]:
-        """The picture that comes out, and STALE for one that noise would have made another than the one before."""
+        """The picture that comes out, and its status.
+
+        SATURATED: some of it is at the end of the range. STALE: noise would have made it another than the one before.
+        """
         picture = self.line.picture(picture)
         before, self._shown = self._shown, picture
+        saturated = self.line.saturated(picture)
+        if saturated is not None:
+            return saturated, Status.SATURATED
         same = noisy and before is not None and (picture is before or np.array_equal(picture, before))
         return picture, Status.STALE if same else Status.OK
 

@@ -130,6 +130,7 @@ class Host:
                 ("rearrange", self._rearrange),
                 ("clamp", self._clamp),
                 ("truth", self._truth),
+                ("show_board", self._show_board),
                 ("inject", self._inject),
                 ("clear_faults", self._clear_faults),
                 ("health", lambda _: Answer(json.dumps(self.world.health()))),
@@ -254,6 +255,15 @@ class Host:
 
     def _clamp(self, payload: bytes) -> None:
         self.world.clamp(messages.decode(payload, messages.STRING).data or None)
+
+    def _show_board(self, payload: bytes) -> None:
+        try:
+            shown = json.loads(messages.decode(payload, messages.STRING).data)
+            board, X_W_B = shown["board"], shown["X_W_B"]
+        except (ValueError, KeyError, TypeError) as error:
+            remedy = "Send JSON with board and X_W_B"
+            raise CommandRefused(topics.WORLD, "show a board", repr(error), remedy) from error
+        self.world.show_board(board, X_W_B)
 
     def _inject(self, payload: bytes) -> None:
         try:

@@ -13,7 +13,7 @@ from drivers.scene import Scene
 from drivers.sim.coupling import Coupling, Grip
 from drivers.sim.health import LOOK, Health, Touch
 from drivers.sim.membrane import Membrane
-from drivers.sim.model import build, mujoco, polar_inertia
+from drivers.sim.model import Glide, build, mujoco, polar_inertia
 from drivers.sim.preflight import refuse_impossible
 from mechanics.polygon import Polygon
 from mechanics.readings import Array, ContactTruth
@@ -25,7 +25,7 @@ SAME_POINT = 1e-4
 #: beyond these the state is nonsense: metres or radians, and their rates
 FARTHEST, FASTEST = 20.0, 200.0
 #: inertia of a degree of freedom that is clamped [kg, kg·m²]: nothing moves it within a step
-IMMOVABLE = 1e9
+IMMOVABLE = 1e4
 #: the largest product of the go's fastest natural frequency and the step that the explicit coupling may see
 RESOLVED = 0.45
 
@@ -66,6 +66,8 @@ class Plant:
         self._steps_per_look = max(1, round(LOOK / timestep))
         self.model = build(scene, self._substep)
         self.data = mujoco.MjData(self.model)
+        self._glide = Glide(self.model, self.data)
+        self._inertias = self.model.dof_M0.copy()
         self._has_eo = scene.extrinsic is not None
         self._owner = [self._body_of(i) for i in range(self.model.ngeom)]
         d = self.data
@@ -84,6 +86,7 @@ class Plant:
     def reset(self) -> None:
         """Back to the start: ee at rest at ``scene.start``, the go hanging from it at rest in free air."""
         mujoco.mj_resetData(self.model, self.data)
+        self._glide.look()
         self.coupling = self._coupling_at(self.scene.grasp)
         self._slipped = self._turned = 0.0
         self.held = True
@@ -129,6 +132,7 @@ class Plant:
         self._apply()
         self._state_of_forces = self._state
         mujoco.mj_step(self.model, self.data)
+        self._glide.look()
         if self._clamped is not None:
             clamped, at = self._clamped
             self._qpos[clamped], self._qvel[clamped] = at, 0.0
@@ -238,12 +242,13 @@ class Plant:
         """
         if body is not None and not (body == "go" or (body == "eo" and self._has_eo)):
             raise CommandRefused("world", "clamp", f"there is no body '{body}'", "Clamp go, or eo where there is one")
-        self.model.dof_armature[:] = 0.0
+        self.model.dof_M0[:] = self._inertias
         self._clamped: tuple[slice, Array] | None = None
         if body is not None:
             first = 0 if body == "go" else 3
             dofs = slice(first, first + 3)
-            self.model.dof_armature[dofs] = IMMOVABLE
+            # the engine takes the inertia of bodies as simple as these from here, and leaves their armature out
+            self.model.dof_M0[dofs] = IMMOVABLE
             self._qvel[dofs] = 0.0
             self._clamped = dofs, self._qpos[dofs].copy()
 

@@ -24,6 +24,7 @@ from drivers.tags import TagDetector, tag_bitmap
 from mechanics.camera import CameraModel, point_in_world
 from mechanics.readings import Array, ImageReading, Stamp, TagReading
 from mechanics.se2 import transform
+from mechanics.tag_board import TagBoard
 
 _BLACK, _WHITE, _BACKGROUND = 20.0, 235.0, 128.0  # grey levels of matt print under even light
 _FINGER = 70.0
@@ -75,14 +76,24 @@ class TagRenderer:
         self.camera = camera
         self._pieces = 4 if camera.distortion.any() else 1
 
-    def render(self, tags: Iterable[tuple[TagMount, Array]], screens: Iterable[Screen] = ()) -> NDArray[np.uint8]:
+    def render(
+        self,
+        tags: Iterable[tuple[TagMount, Array]],
+        screens: Iterable[Screen] = (),
+        board: tuple[TagBoard, Array] | None = None,
+    ) -> NDArray[np.uint8]:
         """Picture (h, w) of tags on bodies at X_W_body (3,); a tag further in front hides what is behind it.
 
-        Screens hide all tags that they stand in front of.
+        Screens hide all tags that they stand in front of, and a board at its X_W_B (4, 4) hides everything behind it.
         """
-        return np.rint(self.paint(tags, screens)).astype(np.uint8)
+        return np.rint(self.paint(tags, screens, board)).astype(np.uint8)
 
-    def paint(self, tags: Iterable[tuple[TagMount, Array]], screens: Iterable[Screen] = ()) -> Array:
+    def paint(
+        self,
+        tags: Iterable[tuple[TagMount, Array]],
+        screens: Iterable[Screen] = (),
+        board: tuple[TagBoard, Array] | None = None,
+    ) -> Array:
         """The same in grey levels, before they are rounded."""
         grey = np.full((self.camera.height, self.camera.width), _BACKGROUND)
         things: list[tuple[float, TagMount | Screen, Array]] = [(mount.height, mount, X_W) for mount, X_W in tags]
@@ -92,7 +103,31 @@ class TagRenderer:
                 self._cover(grey, thing)
             else:
                 self._draw(grey, thing, X_W)
+        if board is not None:
+            self._show(grey, *board)
         return grey
+
+    def _show(self, grey: Array, board: TagBoard, X_W_B: Array) -> None:
+        """The board in front of everything: its paper, and its tags on the side that is printed."""
+        R, origin = X_W_B[:3, :3], X_W_B[:3, 3]
+        w, h = board.half_size
+        corners = np.array([[-w, -h, 0.0], [w, -h, 0.0], [w, h, 0.0], [-w, h, 0.0]])
+        # under distortion the paper's edge is a chord per cell, as a tag's is
+        pieces = 8 * self._pieces * max(board.columns, board.rows)
+        cuts = np.arange(pieces) / pieces
+        sides = corners[:, None] + cuts[:, None] * (np.roll(corners, -1, axis=0) - corners)[:, None]
+        outline = self.camera.project(sides.reshape(-1, 3) @ R.T + origin)
+        if not np.isfinite(outline).all():
+            return  # not all of it is in front of the camera
+        printed = float(R[:, 2] @ (self.camera.X_WC[:3, 3] - origin)) > 0
+        if not printed:
+            outline = outline[::-1]
+        self._blend(grey, outline, np.roll(outline, -1, axis=0), np.array([[_WHITE], [1.0]]) * np.ones(len(outline)))
+        for id in board.ids if printed else ():
+            start, end, level, cover = _boundaries(id, self._pieces)
+            nodes = np.stack((start, end)) * (board.size / 8) + board.centre(id)
+            pixels = self.camera.project(nodes @ R[:, :2].T + origin)
+            self._blend(grey, pixels[0], pixels[1], np.stack((level, cover)))
 
     def _cover(self, grey: Array, screen: Screen) -> None:
         p_W = transform(np.asarray(screen.X_W, float), screen.corners)
@@ -147,6 +182,7 @@ class SimTagCamera(Faulty[TagReading], TagCamera):
         self._equip()
         self._detector: TagDetector | None = None
         self._image: ImageReading | None = None
+        self._board: tuple[TagBoard, Array] | None = None
         self._sequence = 0
 
     def describe(self) -> Description:
@@ -185,8 +221,13 @@ class SimTagCamera(Faulty[TagReading], TagCamera):
         """The picture (mono8) behind the newest `capture`."""
         return self._image
 
+    def show(self, board: TagBoard | None, X_W_B: Array) -> None:
+        """Hold a board before the camera at ``X_W_B`` (4, 4) until told otherwise; None puts it away."""
+        self._board = None if board is None else (board, X_W_B)
+
     def restart(self, rng: np.random.Generator | None = None) -> None:
         """Begin a new epoch after the world was reset, with ``rng``'s noise: frames count from 0, old ones are gone."""
+        self._board = None
         self._rng = rng or self._rng
         self._equip()
         if self._detector is not None:
@@ -209,11 +250,11 @@ class SimTagCamera(Faulty[TagReading], TagCamera):
         moving = self._world.tag_twists() if duration else {}
         moving = {id: twist for id, twist in moving.items() if self._smear(twist) * duration > _SMEAR}
         if not moving:
-            return render.paint(tags, screens)
+            return render.paint(tags, screens, self._board)
         pictures = []
         for t in (np.arange(_POSES) + 0.5) / _POSES * duration - duration / 2:
             at = [(mount, X_W + t * moving[mount.id] if mount.id in moving else X_W) for mount, X_W in tags]
-            pictures.append(render.paint(at, screens))
+            pictures.append(render.paint(at, screens, self._board))
         return np.mean(pictures, axis=0)
 
     def _smear(self, twist: Array) -> float:

@@ -9,6 +9,7 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from drivers.config import StationConfig, TactileConfig, WorldConfig
 from drivers.errors import CommandRefused, DeviceFault
@@ -25,7 +26,9 @@ from drivers.sim.mismatch import Lab, load_profile, stream
 from drivers.sim.plant import ZERO, Plant
 from drivers.sim.screen import FINGER_HALF_SIZE, Screen
 from mechanics import se2
+from mechanics.camera import rigid
 from mechanics.readings import Array, Stamp, TruthReading
+from mechanics.tag_board import TagBoard
 from mechanics.yaml_input import Document, InputError, Refusal, parse
 
 
@@ -245,6 +248,19 @@ class World:
     def clamp(self, body: str | None) -> None:
         """As `Simulation.clamp`."""
         self.plant("world", "clamp").clamp(body)
+
+    def show_board(self, board: TagBoard | dict | None, X_W_B: ArrayLike) -> None:
+        """As `Simulation.show_board`. Raises CommandRefused where there is no camera, or for what cannot be shown."""
+        cameras = [show for device in self.devices.values() if (show := getattr(device, "show", None)) is not None]
+        if not cameras:
+            raise CommandRefused("world", "show a board", "there is no tag camera", "Add one to the station file")
+        try:
+            shown = board if board is None or isinstance(board, TagBoard) else TagBoard.from_dict(board)
+            pose = rigid("its pose X_W_B", X_W_B)
+        except (ValueError, TypeError) as error:
+            raise CommandRefused("world", "show a board", str(error), "Correct the board or its pose") from error
+        for show in cameras:
+            show(shown, pose)
 
     def truth(self) -> TruthReading:
         """The plant's own state at this instant; its sequence number is that of the plant step."""

@@ -6,6 +6,8 @@ through a protocol, the wrist sensor on its lever reads digits, a pose comes wit
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +15,12 @@ import numpy as np
 from drivers.sim.force_torque import Electronics
 from drivers.sim.membrane import Membrane, MembraneSpring
 from drivers.sim.mismatch import ForceTorqueFigures, Lab, load_profile
+from estimation.elasticity_fit import METHODS, fit_elasticity
 from estimation.finger_memory import Path, size
+from estimation.friction_fit import baselines, fit_friction
+from experiments.bench.figures import Figure, figure_of
 from mechanics import se2
+from mechanics.catalogue import load_sensor
 from mechanics.readings import Array
 from mechanics.wrench import about, rotated
 
@@ -34,8 +40,8 @@ AMPLITUDE = np.array([0.003, 0.003, np.radians(4.0)])
 class Session:
     """One run of the elasticity protocol, in the nominal gocf, and the truth behind it, which no fit may see.
 
-    ``x``, ``w`` (n, 3), ``times`` and ``holds`` (n,) are the samples, two readings a hold, ``path`` the set-points; ``true_x`` (n, 3) is in the true
-    gocf, ``K`` and ``membrane`` are the plant's.
+    ``x``, ``w`` (n, 3), ``times`` and ``holds`` (n,) are the samples, two readings a hold, ``path`` the set-points;
+    ``true_x`` (n, 3) is in the true gocf, ``K`` and ``membrane`` are the plant's.
     """
 
     x: Array

@@ -18,6 +18,7 @@ from experiments.context import RunContext
 from mechanics import se2
 from mechanics.elasticity import Elasticity
 from mechanics.readings import Array, Status
+from mechanics.tag_board import TagBoard
 
 #: calibrations take grasps of their own, so that no trial meets the one that was calibrated
 FIRST_GRASP = 10_000
@@ -81,6 +82,20 @@ class Rig:
         else:
             self._person(what)
         self.rest(0.5)
+
+    def show_board(self, board: TagBoard, X_W_B: Array, what: str) -> None:
+        """Hold the tag board before the camera at ``X_W_B`` (4, 4), or as ``what`` tells a person, who may differ."""
+        if self.devices.simulation is not None:
+            self.devices.simulation.show_board(board.as_dict(), X_W_B)
+        else:
+            self._person(what)
+
+    def put_board_away(self) -> None:
+        """Take the tag board out of the picture."""
+        if self.devices.simulation is not None:
+            self.devices.simulation.show_board(None, np.eye(4))
+        else:
+            self._person("Take the tag board away")
 
     def _person(self, what: str) -> None:
         if not self.context.ask(what):

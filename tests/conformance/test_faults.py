@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import threading
 import time
 
 import numpy as np
 import pytest
 
-from drivers.config import BusConfig, ForceTorqueConfig, GripperConfig, StationConfig, WorldConfig
+from drivers.config import (
+    BusConfig,
+    ForceTorqueConfig,
+    GripperConfig,
+    StationConfig,
+    TactileConfig,
+    TagCameraConfig,
+    WorldConfig,
+)
 from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, NotConnected, ProtocolError
 from drivers.fault import Fault
 from drivers.interfaces import ArmTarget
@@ -15,8 +24,19 @@ from drivers.sim.world import World
 from drivers.station import Station
 from mechanics.readings import Status
 
-NAMES = {"arm": "arm", "gripper": "gripper", "force_torque": "wrist_ft", "tag_camera": "camera"}
+NAMES = {
+    "arm": "arm",
+    "gripper": "gripper",
+    "force_torque": "wrist_ft",
+    "tag_camera": "camera",
+    "soft_bubble": "bubble",
+    "gelslim": "gel",
+}
 STREAMS = ("arm", "gripper", "force_torque")
+#: what is asked for a frame
+PICTURES = ("tag_camera", "soft_bubble", "gelslim")
+#: a membrane that is not pressed anew still moves by this at most from frame to frame [0.1 mm]
+LEAST = 1
 
 
 def befalls(fault: str, *kinds: str):
@@ -87,15 +107,15 @@ def test_the_same_readings_are_dropped_for_the_same_seed(lab, fault, kind, scene
     assert 0 < len(first) < 199
 
 
-@befalls("drop", "tag_camera")
+@befalls("drop", *PICTURES)
 def test_a_dropped_frame_is_a_timeout_and_a_gap(lab, fault, kind):
-    camera = lab.devices["camera"]
+    camera = lab.devices[NAMES[kind]]
     lab.clock.sleep(0.1)
     first = camera.capture().stamp.sequence
     inject(lab, fault, kind, value=1.0)
     with pytest.raises(DeviceTimeout) as caught:
         camera.capture()
-    assert caught.value.device == "camera"
+    assert caught.value.device == NAMES[kind]
     lab.simulation.clear_faults()
     assert camera.capture().stamp.sequence == first + 2
     assert camera.gaps == 1
@@ -194,6 +214,24 @@ def become(lab, scene, profile):
         lab.simulation.reset(0, scene, world.model_dump())
 
 
+@befalls("stuck", *PICTURES)
+def test_a_stuck_picture_is_stale_where_noise_would_move_it(lab, fault, kind, scene):
+    become(lab, scene, "lab")
+    camera = lab.devices[NAMES[kind]]
+    assert camera.capture().stamp.status is Status.OK
+    inject(lab, fault, kind)
+    held = camera.capture()
+    lab.clock.sleep(0.1)
+    again = camera.capture()
+    assert again.stamp.status is Status.STALE
+    assert again.stamp.sequence == held.stamp.sequence + 1
+    assert again.stamp.capture_ns == held.stamp.capture_ns + 100_000_000  # stamps advance
+    np.testing.assert_array_equal(content(again), content(held))
+    lab.simulation.clear_faults()
+    assert camera.capture().stamp.status is Status.OK
+    become(lab, scene, "ideal")
+
+
 @befalls("stuck", "arm")
 def test_a_stuck_pose_is_stale_once_the_arm_should_have_moved(lab, fault, kind):
     arm = lab.devices["arm"]
@@ -284,6 +322,67 @@ def test_a_saturated_reading_is_clipped_and_says_so(lab, fault, kind):
     assert np.abs(wrist.latest().wrench).max() == 0.4
 
 
+@befalls("saturate", "gelslim")
+def test_a_picture_with_too_much_light_is_white_where_it_was_bright_and_says_so(lab, fault, kind):
+    finger = lab.devices[NAMES[kind]]
+    good = finger.capture()
+    assert good.stamp.status is Status.OK
+    assert (good.image == 255).mean() < 0.01
+    limit = float(np.median(good.image))
+    inject(lab, fault, kind, value=limit)
+    spoiled = finger.capture()
+    assert spoiled.stamp.status is Status.SATURATED
+    assert (spoiled.image > 250).mean() > 0.4
+    # over the bus a picture comes as JPEG, which is a few levels off
+    assert np.abs(spoiled.image - np.minimum(good.image * (255 / limit), 255)).mean() < 4
+    lab.simulation.clear_faults()
+    healed = finger.capture()
+    assert healed.stamp.status is Status.OK
+    np.testing.assert_array_equal(healed.image, good.image)
+
+
+@befalls("saturate", "soft_bubble")
+def test_a_depth_beyond_the_range_is_the_end_of_the_range_and_says_so(lab, fault, kind):
+    finger = lab.devices[NAMES[kind]]
+    good = finger.capture()
+    assert good.stamp.status is Status.OK
+    limit = int(np.median(good.image))
+    inject(lab, fault, kind, value=limit)
+    spoiled = finger.capture()
+    assert spoiled.stamp.status is Status.SATURATED
+    np.testing.assert_allclose(spoiled.image, np.minimum(good.image, limit), rtol=0, atol=LEAST)
+    assert spoiled.image.max() == limit
+    lab.simulation.clear_faults()
+    assert finger.capture().stamp.status is Status.OK
+
+
+@befalls("saturate", "tag_camera")
+def test_tags_seen_with_too_much_light_are_marked_whatever_was_found(lab, fault, kind):
+    camera = lab.devices[NAMES[kind]]
+    assert camera.capture().stamp.status is Status.OK
+    inject(lab, fault, kind, value=15.0)  # less than the print's black: all is white, no tag is seen
+    blind = camera.capture()
+    assert (blind.stamp.status, blind.detections) == (Status.SATURATED, ())
+    assert camera.image().image.min() == 255
+    lab.simulation.clear_faults()
+    inject(lab, fault, kind, value=150.0)  # only what is white is too bright: the tag is seen, and not to be trusted
+    glaring = camera.capture()
+    assert glaring.stamp.status is Status.SATURATED
+    assert [tag.id for tag in glaring.detections] == [3]
+    lab.simulation.clear_faults()
+    assert camera.capture().stamp.status is Status.OK
+
+
+@befalls("saturate", *PICTURES)
+def test_a_picture_within_the_range_is_not_saturated(lab, fault, kind):
+    camera = lab.devices[NAMES[kind]]
+    good = content(camera.capture())
+    inject(lab, fault, kind, value=65535.0)
+    reading = camera.capture()
+    assert reading.stamp.status is Status.OK
+    np.testing.assert_allclose(content(reading), good, rtol=0, atol=LEAST)
+
+
 # -- garbage -----------------------------------------------------------------------------------------------------------
 
 
@@ -305,17 +404,24 @@ def test_garbage_is_a_protocol_error_counted_and_survived(lab, fault, kind):
     assert device.gaps == 0
 
 
-@befalls("garbage", "tag_camera")
+@befalls("garbage", *PICTURES)
 def test_a_garbled_frame_is_a_protocol_error_and_the_next_is_whole(lab, fault, kind):
-    camera = lab.devices["camera"]
+    camera = lab.devices[NAMES[kind]]
     lab.clock.sleep(0.1)
+    whole = content(camera.capture())
     inject(lab, fault, kind)
-    with pytest.raises(ProtocolError) as caught:
-        camera.capture()
-    assert caught.value.device == "camera"
+    for use in (camera.capture, camera.latest):
+        with pytest.raises(ProtocolError) as caught:
+            use()
+        assert caught.value.device == NAMES[kind]
     assert camera.corrupt == 1
     lab.simulation.clear_faults()
-    assert [tag.id for tag in camera.capture().detections] == [3]
+    np.testing.assert_allclose(content(camera.capture()), whole, rtol=0, atol=LEAST)
+
+
+def content(reading):
+    """What is in a frame: its pixels, or the corners that were found in it."""
+    return reading.image if hasattr(reading, "image") else np.array([tag.corners for tag in reading.detections])
 
 
 # -- disconnect --------------------------------------------------------------------------------------------------------
@@ -418,6 +524,59 @@ def test_in_real_time_a_device_that_fell_silent_is_a_timeout(endpoint, scene):
         wrist.latest()
 
 
+def test_in_real_time_pictures_come_at_their_rates_and_a_fault_shows_in_the_stream(endpoint, scene):
+    """By events: each stream is listened to until ten frames have come. The machine may be slow, time may not be."""
+    config = StationConfig(
+        name="bench",
+        world=WorldConfig(clock="realtime"),
+        bus=BusConfig(endpoint=endpoint),
+        devices={
+            "camera": TagCameraConfig(
+                kind="tag_camera", width=320, height=240, focal=300.0, position=(0, -0.5, 0.2), look_at=(0, 0, 0.2)
+            ),
+            "gel": TactileConfig(kind="tactile", sensor="gelslim", finger="left", width=160, height=120),
+        },
+    )
+    with Station(config).connect() as devices:
+        assert devices.simulation is not None
+        devices.simulation.reset(0, scene)
+        heard = {device: Heard(device, 10) for device in (devices.camera, devices.tactile("left"))}
+        for device, frames in heard.items():
+            stamps = frames.wait()
+            rate = {"camera": 10.0, "gel": 30.0}[device.name]
+            assert device.describe().rate == rate
+            # what does not get through is counted, and what comes is in order
+            sequences = [stamp.sequence for stamp in stamps]
+            assert np.all(np.diff(sequences) >= 1)
+            periods = np.diff([stamp.capture_ns for stamp in stamps]) * 1e-9
+            assert np.all(periods > 0)
+            per_frame = periods.sum() / (sequences[-1] - sequences[0])
+            assert 1 / 3 < per_frame * rate < 3
+            assert {stamp.status for stamp in stamps} == {Status.OK}
+        devices.simulation.inject({"kind": "saturate", "device": "gel", "value": 60.0})
+        saturated = Heard(devices.tactile("left"), 1, Status.SATURATED)
+        assert saturated.wait()[-1].status is Status.SATURATED
+
+
+class Heard:
+    """The stamps of a stream from now on, until ``count`` of them have the status."""
+
+    def __init__(self, device, count, status=Status.OK):
+        self.stamps, self._count, self._status = [], count, status
+        self._enough = threading.Event()
+        self._stop = device.listen(self._take)
+
+    def _take(self, reading):
+        self.stamps.append(reading.stamp)
+        if [stamp.status for stamp in self.stamps].count(self._status) >= self._count:
+            self._enough.set()
+
+    def wait(self):
+        assert self._enough.wait(20.0), f"only {self.stamps}"
+        self._stop()
+        return self.stamps[:]
+
+
 @befalls("drop", "force_torque")
 def test_a_reset_ends_what_was_injected(lab, fault, kind, scene):
     inject(lab, fault, kind, value=1.0)
@@ -433,6 +592,8 @@ def test_a_reset_ends_what_was_injected(lab, fault, kind, scene):
         ({"kind": "freese", "device": "arm"}, "freeze"),
         ({"kind": "drop", "device": "arm"}, "share of readings"),
         ({"kind": "bias", "device": "camera", "value": 1.0}, "means nothing"),
+        ({"kind": "saturate", "device": "arm", "value": 1.0}, "means nothing"),
+        ({"kind": "saturate", "device": "bubble"}, "end of the range"),
     ],
 )
 def test_a_fault_that_cannot_be_is_refused(lab, wrong, says):

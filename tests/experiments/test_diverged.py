@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import threading
+from dataclasses import replace
 from math import nan
 
 import pytest
@@ -84,6 +85,25 @@ def test_run_ends_as_diverged_with_one_and_without_nan(sick_station, tmp_path):
     assert results["status"] == "fell_short"
     assert results["health"]["seconds"] == pytest.approx(SICK * 1e-3)
     assert (tmp_path / "run" / "report.html").exists()
+
+
+def test_stages_after_a_divergence_do_not_run_and_are_listed_with_the_reason(sick_station, tmp_path):
+    first = sick_station.experiment
+    plan, execute = first.stages
+    later = (*first.stages, execute, plan.model_copy(update={"name": "another"}))
+    again = replace(sick_station, experiment=first.model_copy(update={"stages": later}))
+    outcome = run(again, tmp_path / "run", Console(quiet=True))
+    assert outcome.exit_code is ExitCode.FELL_SHORT
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    (trial,) = results["trials"]
+    reason = f"{trial['name']} ended as diverged"
+    assert results["not_run"] == [
+        {"stage": "execute", "name": plan.name, "reason": reason},
+        {"stage": "plan", "name": "another", "reason": reason},
+    ]
+    assert [made["name"] for made in results["plans"]] == [plan.name]
+    events = [json.loads(line)["text"] for line in (tmp_path / "run" / "events.jsonl").read_text().splitlines()]
+    assert f"execute {plan.name}: not run, for {reason}" in events
 
 
 def test_what_the_health_monitor_flags_is_a_warning_among_the_events(resolved, tmp_path, monkeypatch):

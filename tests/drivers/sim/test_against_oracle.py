@@ -92,6 +92,16 @@ def test_shape_in_hand_pressed_and_turned_on_the_ground(name):
     check(f"{name} in hand", pair.follow([*press, *turning, turning[-1] + BIAS, turning[-1] - BIAS]))
 
 
+@pytest.mark.parametrize("name", SHAPES)
+def test_shape_in_hand_turned_by_two_degrees_a_step(name):
+    task = ground_task(name)
+    start = np.radians(15)
+    pair = Pair(task.scene(start))
+    pair.approach(task.ee(start, (0.0, 0.0)))
+    turning = [task.ee(np.radians(a), (0.0, 4.0)) for a in (15, 17, 19, 21, 23, 25, 23, 21)]
+    check(f"{name} in hand, 2° a step", pair.follow(turning))
+
+
 @pytest.mark.parametrize("name", PIVOTS)
 def test_object_pressed_flat_by_a_corner_that_turns_on_it(name):
     task = pivot_task(name)
@@ -152,10 +162,10 @@ def test_apex_of_an_object_under_a_face(name):
 # -- where one slips -----------------------------------------------------------------------------------------------
 
 
-def slipped(what: str, plant: float, oracle: float) -> None:
+def slipped(what: str, plant: float, oracle: float, rel: float = 0.3) -> None:
     tell(f"{what:34} slips {plant * 1e3:8.3f} mm, oracle {oracle * 1e3:8.3f} mm")
     assert abs(oracle) > 0.3e-3, "the case must slip"
-    assert plant == pytest.approx(oracle, rel=0.3)
+    assert plant == pytest.approx(oracle, rel=rel)
 
 
 def drag(pair: Pair, stands, distance: float) -> Iterable[float]:
@@ -173,7 +183,7 @@ def test_corner_dragged_over_the_ground(direction):
     pair.approach(task.ee(angle, (0.0, 0.0)))
     for gone in drag(pair, task.ee(angle, (0.0, 4.0)), direction * 0.03):
         at, expected = (corner_of(go, task.held)[0] for go in (pair.plant.go, pair.oracle.go))
-        slipped(f"corner on the ground, {gone * 1e3:+.1f} mm", at, expected)
+        slipped(f"corner on the ground, {gone * 1e3:+.1f} mm", at, expected, 0.005)
 
 
 @pytest.mark.parametrize("direction", [-1, 1])
@@ -184,7 +194,7 @@ def test_corner_dragged_over_a_block(direction):
     pair.approach(task.ee(angle, (0.0, 0.0)))
     for gone in drag(pair, task.ee(angle, (0.0, 4.0)), direction * 0.03):
         at, expected = (corner_of(go, task.held)[0] - task.at[0] for go in (pair.plant.go, pair.oracle.go))
-        slipped(f"corner on a block, {gone * 1e3:+.1f} mm", at, expected)
+        slipped(f"corner on a block, {gone * 1e3:+.1f} mm", at, expected, 0.005)
 
 
 @pytest.mark.parametrize("direction", [-1, 1])
@@ -198,14 +208,14 @@ def test_block_dragged_from_above(direction):
         slipped(f"block on the ground, {gone * 1e3:+.1f} mm", pair.plant.eo[0], pair.oracle.eo[0])
 
 
-def pivoted(task, degrees: float) -> Pair:
-    """Preloaded and turned in steps of 1°, one second each."""
+def pivoted(task, degrees: float, ramp: float = 0.8) -> Pair:
+    """Preloaded and turned in steps of 1°, one second each with ramps of 0.8 s."""
     pair = Pair(task.scene())
     pair.approach(task.ee(0.0, 0.0))
     for level in np.linspace(0, 1, 6)[1:]:
         pair.go_to(task.ee(0.0, level), 0.1, 0.0)
     for angle in -np.radians(np.arange(1.0, degrees + 1)):
-        pair.go_to(task.ee(angle), 0.8, 0.2, 2)
+        pair.go_to(task.ee(angle), ramp, 0.2, 2)
     return pair
 
 
@@ -237,10 +247,46 @@ def test_pivot_that_slips_for_want_of_friction_at_the_object(name):
     slipped(f"{name}, the go's corner slips", at, expected)
 
 
+def run_on(task, ramp: float) -> float:
+    """How far the go's corner slips by the oracle with inertia, which begins where the corner nears its cone."""
+    oracle = Oracle(task.scene())
+    oracle.move(task.ee(0.0, 0.0), 4)
+    oracle.move(task.ee(0.0), 5)
+    near = False
+    for angle in -np.radians(np.arange(1.0, 26.0)):
+        near = near or task.pivot.needs(angle, task.force)[0] > 0.9 * task.mu_object
+        if near:
+            oracle.drive(task.ee(angle), ramp, 80, 0.1)
+        else:
+            oracle.move(task.ee(angle))
+    return along_face(task, oracle.eo, oracle.go)
+
+
+@pytest.mark.parametrize("ramp", [0.8, 0.4])
+@pytest.mark.parametrize("name", ["heptagon", "pentagon", "triangle"])
+def test_slip_runs_on_by_the_inertia_of_the_bodies(name, ramp):
+    """Newton's share in a slip, which the quasi-static oracle leaves out: with it, short ramps agree, too."""
+    task = pivot_task(name)
+    task = replace(task, mu_object=0.93 * task.needs[0])
+    pair = pivoted(task, 25, ramp)
+    at, still = (along_face(task, p.eo, p.go) for p in (pair.plant, pair.oracle))
+    expected = run_on(task, ramp)
+    slipped(f"{name} with inertia, ramps of {ramp} s", at, expected, 0.1)
+    assert abs(at - expected) < 0.6 * abs(at - still) or at == pytest.approx(still, rel=0.03)
+
+
+def test_slip_that_feeds_itself_is_the_quasi_static_one_where_the_ramps_are_slow():
+    task = pivot_task("heptagon")
+    task = replace(task, mu_object=0.93 * task.needs[0])
+    pair = pivoted(task, 25, 1.6)
+    at, expected = (along_face(task, p.eo, p.go) for p in (pair.plant, pair.oracle))
+    slipped("heptagon, ramps of 1.6 s", at, expected, 0.05)
+
+
 def test_slip_that_feeds_itself_is_as_sensitive_to_friction_as_the_oracle_says():
     """The heptagon's corner slips toward the apex, where it needs more friction: 1 % of µ is 10 % of the slip.
 
-    The realised friction of a slow slip is within 2 % of nominal, and the slip within what the oracle makes of that.
+    With ramps of 0.8 s its inertia runs it on as 2 to 3 % less friction would.
     """
     task = pivot_task("heptagon")
     task = replace(task, mu_object=0.93 * task.needs[0])

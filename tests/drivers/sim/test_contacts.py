@@ -220,3 +220,33 @@ def test_records_say_what_the_engine_says_of_each_contact(make_scene, direction)
         recorded = sum((c.force for c in plant.contacts() if (c.by, c.on) == pair), np.zeros(2))
         np.testing.assert_allclose(recorded, force, atol=1e-12)
     assert set(by_engine) == {("ground", "eo"), ("go", "eo")}
+
+
+@pytest.mark.parametrize("speed", [-0.02, -0.002, 0.002, 0.02])
+def test_slipping_corner_stays_closed_and_at_its_cone(make_scene, speed):
+    """From rest to a steady slip at once, and to rest again: no step without contact, friction at µ while it slips."""
+    plant = standing(
+        make_scene,
+        outline("hbox"),
+        8.0,
+        np.append(np.array([0.0, 0.063]) - turn(0.3) @ -HALF, 0.3),
+        friction={"go-ground": 0.33, "go-eo": 0.33, "eo-ground": 2.0},
+    )
+    press(plant, (0.0, -6e-3))
+    assert len(by_go(plant)) == 1
+    changes, slipping = plant.contact_changes, []
+    x, y, angle = plant.ee_pose
+    steps = round(0.01 / abs(speed) * 1e3)
+    for i in range(1, steps + 1):
+        plant.step((x + speed * i * 1e-3, y, angle), (speed, 0.0, 0.0))
+        slipping += [contact for contact in by_go(plant) if contact.mode != "stick"]
+    # the fingers give way first, for most of the way
+    assert len(slipping) > 0.2 * steps
+    ratios = [abs(contact.force[0] / contact.force[1]) for contact in slipping]
+    np.testing.assert_allclose(ratios, 0.33, rtol=2e-3)
+    for _ in range(300):
+        plant.step(plant.ee_pose, REST)
+    assert plant.contact_changes == changes
+    (contact,) = by_go(plant)
+    assert contact.mode == "stick"
+    assert plant.health()["flags"] == []

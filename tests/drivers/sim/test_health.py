@@ -54,7 +54,7 @@ def test_resting_block_is_well(block):
 def untuned(monkeypatch):
     """The contacts that the engine has by default: soft, and no stiffer in friction than along the normal."""
     monkeypatch.setattr(model, "SOLIMP", (0.9, 0.95, 0.001, 0.5, 2.0))
-    monkeypatch.setattr(model, "SOLREF", (0.02, 1.0))
+    monkeypatch.setattr(model, "SOLREF", (-1 / 0.02**2, -2 / 0.02))
     monkeypatch.setattr(model, "FRICTION_IMPEDANCE", 1.0)
 
 

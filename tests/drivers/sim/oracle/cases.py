@@ -28,7 +28,8 @@ class PivotTask:
     """An eo that turns clockwise about its bottom-right vertex, which stands at W's origin.
 
     ``tilt`` is the angle from the face's normal to the go's axis; ``needs`` are the friction coefficients at the
-    go's contact and the ground that the notes of the study state, ``mu_ground`` what is given.
+    go's contact and the ground that the notes of the study state, ``mu_ground`` what is given. ``start`` and ``end``
+    are how far it has turned when it comes to the go and at the end; it stands on its lower face where ``start`` is 0.
     """
 
     name: str
@@ -41,6 +42,8 @@ class PivotTask:
     needs: tuple[float, float]
     force: float = 3.0
     mu_object: float = 0.33
+    start: float = 0.0
+    end: float = -float(np.radians(25.0))
 
     def go_angle(self, angle: float) -> float:
         """θ of the go in W with the eo at ``angle``."""
@@ -61,13 +64,13 @@ class PivotTask:
         return self.held.ee(self.go_angle(angle) + lean, self.pivot.at(angle), push)
 
     def scene(self) -> Scene:
-        """The eo stands flat, the go hangs 5 mm off its face."""
-        start = self.ee(0.0, 0.0)
-        start[:2] -= 0.005 * self.pivot.normal
+        """The eo as it is at the start, the go hangs 5 mm off its face."""
+        start = self.ee(self.start, 0.0)
+        start[:2] -= 0.005 * turn(self.start) @ self.pivot.normal
         return Scene(
             grasped=self.grasped,
             extrinsic=self.extrinsic,
-            extrinsic_pose=_floats(self.pivot.eo(0.0)),
+            extrinsic_pose=_floats(self.pivot.eo(self.start)),
             grasp=(*_floats(GRASP), 0.0),
             stiffness=soft_bubble(),
             friction={"go-ground": 0.33, "go-eo": self.mu_object, "eo-ground": self.mu_ground},
@@ -129,6 +132,17 @@ def pivot_task(name: str, **changes) -> PivotTask:
         }[name]
         task = _task(shape(name), go, from_apex, top_at, mu, needs)
     return replace(task, **changes)
+
+
+def tilted_pivot_task(name: str) -> PivotTask:
+    """Of those shapes that µ = 0.33 cannot turn from flat: the turn from a tilt at which something else holds it."""
+    from_apex, mass, start, end, needs = {
+        "pentagon": (0.012, 0.1, 10.0, 35.0, (0.22, 0.24)),
+        "triangle": (0.032, 0.1, 30.0, 55.0, (0.27, 0.27)),
+    }[name]
+    eo = shape(name).model_copy(update={"mass": mass})
+    task = _task(eo, shape("tall_box"), from_apex, None, 0.33, needs)
+    return replace(task, name=f"tilted {name}", start=-float(np.radians(start)), end=-float(np.radians(end)))
 
 
 PIVOTS = ("tall_box", "z", "heptagon", "pentagon", "triangle")

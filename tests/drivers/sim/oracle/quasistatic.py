@@ -9,8 +9,9 @@ where φ is the gap of a vertex over an edge and the slip is the change of the v
 functions of the poses in space, not of rates, so that a sticking vertex stays where it is on its edge for ever. The
 complementarity problem of one linearisation is solved by Lemke and the linearisation is repeated at the solution.
 
-Nothing here is dynamic, and nothing is taken from the package. Inside, lengths are in mm, forces in N and angles in
-units of 1/ARM rad, so that all unknowns are of one size; the interface is SI.
+`move` is quasi-static. `drive` steps in time, with the bodies' inertia but without any damping. Nothing is taken from
+the package. Inside, lengths are in mm, forces in N and angles in units of 1/ARM rad, so that all unknowns are of one
+size; the interface is SI.
 """
 
 from __future__ import annotations
@@ -111,6 +112,9 @@ class Oracle:
         self._mu |= {(b, a): mu for (a, b), mu in self._mu.items()}
         self._bodies = outlines
         self._pairs = [(a, b) for a in outlines for b in [*outlines, GROUND] if a is not b]
+        self._inertia = np.concatenate(
+            [_inertia(body) for body in (scene.grasped, scene.extrinsic) if body is not None]
+        )
         self._slips: dict[tuple, float] = {}
         self.touches: list[Touch] = []
         self.iterations = 0
@@ -149,7 +153,19 @@ class Oracle:
             self._ee = start + i / steps * (goal - start)
             self._balance()
 
-    def _balance(self) -> None:
+    def drive(self, ee, seconds: float, steps: int, rest: float = 0.0) -> None:
+        """Bring the end-effector to X_W_ee (3,) along a quintic ramp, then ``rest`` [s], in steps of equal length."""
+        goal, start, h = np.asarray(ee, float) * [1e3, 1e3, 1.0], self._ee, seconds / steps
+        before = self._q.copy()
+        for i in range(1, steps + 1 + round(rest / h)):
+            s = min(i / steps, 1.0)
+            self._ee = start + s**3 * (10 - 15 * s + 6 * s * s) * (goal - start)
+            coasting = 2 * self._q - before
+            before = self._q.copy()
+            self._balance(self._inertia / h**2, coasting)
+
+    def _balance(self, inertia: np.ndarray | float = 0.0, coasting: np.ndarray | float = 0.0) -> None:
+        """Find the poses in balance; ``inertia`` [N/mm] draws them to where they would be ``coasting``."""
         q = self._q.copy()
         near = self._near(q)
         places = np.array([self._place(q, *contact)[1] for contact in near])
@@ -166,6 +182,7 @@ class Oracle:
             N = np.array([r[2] for r in rows]).reshape(m, len(q))
             T = np.array([r[3] for r in rows]).reshape(m, len(q))
             load, A = self._stiffness(q)
+            load, A = load + inertia * (coasting - q), A + inertia * np.eye(len(q))
             normal, along = _solve(A, load + weight, gap, slip, N, T, mu)
             step = np.linalg.solve(A, load + weight + N.T @ normal + T.T @ along)
             q += step
@@ -268,6 +285,15 @@ def _solve(A, load, gap, slip, N, T, mu) -> tuple[np.ndarray, np.ndarray]:
     moved = J @ np.linalg.solve(A, load)
     z = lemke(M, np.concatenate([gap + moved[:m], slip + moved[m : 2 * m], -slip + moved[2 * m :], np.zeros(m)]))
     return z[:m], z[m : 2 * m] - z[2 * m : 3 * m]
+
+
+def _inertia(body) -> np.ndarray:
+    """Of a body's three unknowns [N·s²/mm]."""
+    v = np.asarray(body.vertices, float)
+    w = np.roll(v, -1, axis=0)
+    cross = v[:, 0] * w[:, 1] - v[:, 1] * w[:, 0]
+    polar = body.mass * (cross @ (v * v + v * w + w * w).sum(axis=1)) / (6 * cross.sum())
+    return np.array([body.mass, body.mass, polar * 1e6 / ARM**2]) * 1e-3
 
 
 def _outline(name: str, body, at: int, gravity: float) -> _Outline:

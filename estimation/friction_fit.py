@@ -1,0 +1,293 @@
+"""A friction coefficient with its interval from contact forces in random motion (*Friction Model Identification*).
+
+Forces of a contact that slips lie on the cone's edges, |f_t| = µ f_n; those of one that sticks lie anywhere within. The
+likelihood of a sample is a mixture of three: an atom on the edge, as wide as the force's noise; a uniform share of the
+cone, blurred by the same noise; and a few outliers anywhere. The edge of the mixture is the coefficient, whatever the
+share that slips, which neither the largest ratio nor a quantile can say. The cone's apex is a nuisance with a prior: a
+zero that is off by 0.1 N is 10 % of the ratio at 1 N.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+from scipy.spatial import ConvexHull, QhullError
+from scipy.special import expit, ndtr
+from scipy.stats import norm
+
+from estimation.errors import FitError, finite_rows
+from mechanics.readings import Array
+
+#: below this normal force a ratio is noise [N]
+LEAST_NORMAL_FORCE = 1.0
+#: noise that is assumed of a force [N], averaged over a few readings
+FORCE_NOISE = 0.02
+#: how far a tared zero may be off, 1 sigma [N]
+ZERO_ERROR = 0.1
+#: calibration error of each force axis, relative, 1 sigma: it scales the ratio and no sample shows it
+GAIN_ERROR = 0.005
+#: samples that must slip, and by how much slip must raise the log likelihood
+_SLIPPING, _EVIDENCE = 8.0, 6.0
+#: an atom this wide, over the noise, is no edge
+_WIDEST = 6.0
+#: share of outliers at most: with more, a wrong cone explains anything
+MOST_OUTLIERS = 0.1
+#: parameters of the likelihood without shares: µ, apex (2), log width of the atom
+_PARAMETERS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionFit:
+    """A coefficient ``mu`` with ``interval``, its 95 % one, from ``samples`` forces above the least normal force.
+
+    ``slipping`` and ``outliers`` are shares of the samples; ``apex`` (2,) [N] = (f_n, f_t) is where the cone's tip
+    lies in the readings; ``sides`` are the signs of f_t on which slip was seen. With one side only, apex and µ are told
+    apart by the prior and the spread of f_n alone, and the interval is wider for it. ``noise`` [N] is that of a force
+    across the edge, as found.
+    """
+
+    mu: float
+    interval: tuple[float, float]
+    samples: int
+    slipping: float
+    outliers: float
+    apex: Array
+    noise: float
+    sides: tuple[int, ...]
+
+    @property
+    def standard_error(self) -> float:
+        """1 sigma of ``mu``."""
+        return (self.interval[1] - self.interval[0]) / (2 * 1.959964)
+
+
+def fit_friction(
+    force: ArrayLike,
+    *,
+    force_noise: float = FORCE_NOISE,
+    slip_speed: ArrayLike | None = None,
+    slip_speed_noise: float = 0.002,
+    zero_error: float = ZERO_ERROR,
+    gain_error: float = GAIN_ERROR,
+) -> FrictionFit:
+    """The coefficient from ``force`` (n, 2) = (f_n, f_t) [N] of one contact in random motion.
+
+    ``force_noise`` is 1 sigma of one component. Samples should be at least as far apart as the noise is correlated.
+    ``slip_speed`` (n,) [m/s], where known, parts the samples at three times its noise, and each part gets shares of its
+    own. ``zero_error`` [N] and ``gain_error`` (relative) are 1 sigma of what a tare and the sensor's calibration leave.
+    Raises FitError for NaN, too few samples, no normal or no tangential force, or when no slip is seen.
+    """
+    values = finite_rows("contact forces", force, (2,), ("f_n", "f_t"))
+    if force_noise <= 0:
+        raise FitError("force_noise", "a positive number [N]", f"{force_noise:g}", "Take the sensor's noise.")
+    fast = _fast(slip_speed, slip_speed_noise, len(values))
+    pressed = values[:, 0] > LEAST_NORMAL_FORCE
+    if not pressed.any():
+        raise FitError(
+            "contact forces",
+            f"a normal force f_n above {LEAST_NORMAL_FORCE:g} N",
+            f"at most {values[:, 0].max(initial=0.0):.3g} N: the normal axis is not excited",
+            "Press harder, and check the sign: f_n > 0 pushes.",
+        )
+    least = 3 * _PARAMETERS
+    if pressed.sum() < least:
+        raise FitError(
+            "contact forces",
+            f"at least {least} above {LEAST_NORMAL_FORCE:g} N",
+            f"{int(pressed.sum())} of {len(values)}",
+            "Record longer, or press harder.",
+        )
+    values, fast = values[pressed], fast[pressed]
+    if np.percentile(np.abs(values[:, 1]), 95) < 3 * max(force_noise, zero_error / 3):
+        raise FitError(
+            "contact forces",
+            "tangential forces f_t above their noise",
+            f"95 % below {np.percentile(np.abs(values[:, 1]), 95):.2g} N: the tangential axis is not excited",
+            "Drag the object along the surface, do not only press it.",
+        )
+    return _Cone(values, fast, force_noise, zero_error).fit(gain_error)
+
+
+def _fast(slip_speed: ArrayLike | None, noise: float, n: int) -> NDArray[np.bool_]:
+    if slip_speed is None:
+        return np.zeros(n, bool)
+    speed = finite_rows("slip speed", np.asarray(slip_speed, float)[:, None], (1,))[:, 0]
+    if len(speed) != n:
+        raise FitError(
+            "slip speed", f"one for each of {n} forces", f"{len(speed)}", "Resample it to the force's times."
+        )
+    return np.abs(speed) > 3 * noise
+
+
+class _Cone:
+    """The mixture's likelihood of f_t given f_n, for checked samples.
+
+    Parameters, in units in which they move alike: µ, apex f_n, apex f_t, log width over the noise, and for each group
+    of samples the logits of its shares that slip and that are outliers.
+    """
+
+    def __init__(self, force: Array, fast: NDArray[np.bool_], noise: float, zero_error: float):
+        self._force, self._noise, self._zero = force, noise, zero_error
+        self._groups = [group for group in (~fast, fast) if group.any()]
+        self._span = float(np.abs(force[:, 1]).max()) * 1.05
+        self._unit = np.array([0.01, 0.3 * zero_error, 0.3 * zero_error, 0.2, *[0.5] * (2 * len(self._groups))])
+
+    def _densities(self, p: Array) -> Array:
+        """Densities (n, 3) [1/N] of |f_t| from the apex: slipping, sticking, neither."""
+        mu, width = p[0], np.exp(p[3]) * self._noise * np.sqrt(1 + p[0] ** 2)
+        edge = mu * np.maximum(self._force[:, 0] - p[1], 0.25 * LEAST_NORMAL_FORCE)
+        side = np.abs(self._force[:, 1] - p[2])
+        beyond = (side - edge) / width
+        atom = np.exp(-0.5 * beyond**2) / (width * np.sqrt(2 * np.pi))
+        within = (ndtr(-beyond) - ndtr(-(side + edge) / width)) / edge
+        return np.stack([atom, within, np.full_like(side, 1 / self._span)], axis=-1)
+
+    def _shares(self, p: Array) -> Array:
+        """Shares (n, 3) of the three, by the group of each sample."""
+        shares = np.empty((len(self._force), 3))
+        for k, group in enumerate(self._groups):
+            slip, out = expit(p[_PARAMETERS + 2 * k : _PARAMETERS + 2 * k + 2])
+            out *= MOST_OUTLIERS
+            shares[group] = (1 - out) * slip, (1 - out) * (1 - slip), out
+        return shares
+
+    def _cost(self, z: Array) -> float:
+        p = z * self._unit
+        if p[0] <= 1e-4 or abs(p[3]) > 5:
+            return 1e9
+        joint = self._densities(p) * self._shares(p)
+        # weak priors keep a share or a width that the samples do not show from running away
+        prior = float(np.sum((p[1:3] / self._zero) ** 2) + p[3] ** 2 + np.sum((p[_PARAMETERS:] / 3) ** 2))
+        return 0.5 * prior - self._sides(p) - float(np.log(np.maximum(joint.sum(axis=1), 1e-300)).sum())
+
+    def _sides(self, p: Array) -> float:
+        """Log likelihood of the sides on which the samples lie, each side with its own share.
+
+        Without it an apex that slides along the one edge which a drag to one side shows would cost nothing.
+        """
+        up = ndtr((self._force[:, 1] - p[2]) / self._noise).sum()
+        counts = np.array([up, len(self._force) - up])
+        return float(np.sum(counts * np.log(np.maximum(counts, 1e-9) / len(self._force))))
+
+    def _starts(self) -> list[Array]:
+        """The three best of a grid of coefficients and widths, with the apex at zero, a tenth of a unit apart."""
+        ratios = np.abs(self._force[:, 1]) / self._force[:, 0]
+        grid = np.unique(np.quantile(ratios, np.linspace(0.2, 1.0, 80)))
+        shares = [-0.5, -0.5] * len(self._groups)
+        trials = [np.array([mu, 0, 0, wide, *shares]) / self._unit for mu in grid[grid > 1e-3] for wide in (0.0, 1.2)]
+        return sorted(trials, key=self._cost)[:3]
+
+    def fit(self, gain_error: float) -> FrictionFit:
+        """The maximum, checked for slip, with an interval from the curvature there."""
+        found = [minimize(self._cost, z, method="L-BFGS-B", options={"maxiter": 200}) for z in self._starts()]
+        best = min(found, key=lambda one: one.fun)
+        z, p = best.x, best.x * self._unit
+        mu = float(p[0])
+        joint = self._densities(p) * self._shares(p)
+        of = joint / np.maximum(joint.sum(axis=1, keepdims=True), 1e-300)
+        self._check_slip(p, float(best.fun), of)
+        covariance = np.linalg.pinv(_hessian(self._cost, z, np.full(len(z), 0.05)), hermitian=True)
+        variance = covariance[0, 0] * self._unit[0] ** 2 + 2 * (gain_error * mu) ** 2
+        half = float(norm.ppf(0.975)) * float(np.sqrt(max(variance, 0.0)))
+        signs = np.sign(self._force[:, 1] - p[2])
+        firm = (signs[:, None] == (-1, 1)) & (of[:, :1] > 0.5)
+        sides = tuple(side for side, seen in zip((-1, 1), firm.sum(axis=0), strict=True) if seen >= 0.5 * _SLIPPING)
+        return FrictionFit(
+            mu=mu,
+            interval=(mu - half, mu + half),
+            samples=len(of),
+            slipping=float(of[:, 0].mean()),
+            outliers=float(of[:, 2].mean()),
+            apex=p[1:3].copy(),
+            noise=float(np.exp(p[3])) * self._noise,
+            sides=sides,
+        )
+
+    def _check_slip(self, p: Array, cost: float, of: Array) -> None:
+        slipping = float(of[:, 0].sum())
+        # the best that sticking and outliers alone can do
+        stuck = p.copy()
+        stuck[_PARAMETERS::2] = -20.0
+        fixed = np.zeros(len(p), bool)
+        fixed[_PARAMETERS::2] = True
+        unused = 0.5 * float(np.sum((stuck[fixed] / 3) ** 2))
+
+        def alone(free: Array) -> float:
+            z = stuck / self._unit
+            z[~fixed] = free
+            return self._cost(z) - unused
+
+        ratios = np.abs(self._force[:, 1] - p[2]) / self._force[:, 0]
+        starts = [np.array([mu, *stuck[1:]]) for mu in np.quantile(ratios, [0.9, 0.95, 0.99, 1.0])] + [stuck]
+        costs = [
+            minimize(alone, (start / self._unit)[~fixed], method="L-BFGS-B", options={"maxiter": 60}).fun
+            for start in starts
+        ]
+        if slipping >= _SLIPPING and min(costs) - cost > _EVIDENCE and np.exp(p[3]) < _WIDEST:
+            return
+        raise FitError(
+            "contact forces",
+            f"slip: at least {_SLIPPING:g} samples that gather on the cone's edge",
+            f"{slipping:.0f} of {len(of)} that could: no slip seen along the tangential axis, µ is at least {p[0]:.3g}",
+            "Drag further or faster, or press less, until the contact slides.",
+        )
+
+
+def _hessian(cost, p: Array, steps: Array) -> Array:
+    n = len(p)
+    H = np.zeros((n, n))
+    e = np.diag(steps)
+    for i in range(n):
+        for j in range(i, n):
+            corners = cost(p + e[i] + e[j]) - cost(p + e[i] - e[j]) - cost(p - e[i] + e[j]) + cost(p - e[i] - e[j])
+            H[i, j] = H[j, i] = corners / (4 * steps[i] * steps[j])
+    return H
+
+
+def baselines(force: ArrayLike) -> dict[str, float]:
+    """What simpler methods say, by name: the largest ratio, the steepest edge of the convex hull, the 95 % quantile.
+
+    The hull is the cone through the apex that the hull of the mirrored samples supports.
+    """
+    values = finite_rows("contact forces", force, (2,), ("f_n", "f_t"))
+    values = values[values[:, 0] > LEAST_NORMAL_FORCE]
+    ratio = np.abs(values[:, 1]) / values[:, 0]
+    return {"maximum": float(ratio.max()), "hull": _hull(values), "quantile": float(np.quantile(ratio, 0.95))}
+
+
+def _hull(values: Array) -> float:
+    """Half the opening of the hull's upper edge: least squares slope of its vertices against f_n."""
+    folded = np.column_stack([values[:, 0], np.abs(values[:, 1])])
+    try:
+        corners = folded[ConvexHull(np.vstack([folded, [0.0, 0.0]])).vertices[:-1] % len(folded)]
+    except QhullError:
+        corners = folded
+    upper = corners[corners[:, 1] / corners[:, 0] >= np.quantile(folded[:, 1] / folded[:, 0], 0.9)]
+    return float(upper[:, 0] @ upper[:, 1] / (upper[:, 0] @ upper[:, 0]))
+
+
+def sliding_forces(
+    force: ArrayLike, times: ArrayLike, position: ArrayLike, position_times: ArrayLike, faster_than: float = 0.02
+) -> Array:
+    """The forces (m, k) of ``force`` (n, k) at ``times`` (n,) [s] while a point is faster than ``faster_than`` [m/s].
+
+    ``position`` (m, 2) [m] at ``position_times`` (m,) [s] may have another rate; its speed is taken over 50 ms, so that
+    the noise of a position does not count as motion. Raises FitError for NaN, or where the two do not overlap.
+    """
+    readings = np.asarray(force, float)
+    readings = finite_rows("forces", readings, readings.shape[1:])
+    at = finite_rows("times of the forces", np.asarray(times, float)[:, None], (1,))[:, 0]
+    points = finite_rows("positions", position, (2,), ("x", "y"))
+    t = finite_rows("times of the positions", np.asarray(position_times, float)[:, None], (1,))[:, 0]
+    half = 0.025
+    inside = (at > t[0] + half) & (at < t[-1] - half)
+    if not inside.any():
+        raise FitError("times", "forces and positions that overlap", "none that do", "Check the clocks.")
+    ends = [
+        np.stack([np.interp(at[inside] + shift, t, points[:, k]) for k in range(2)], axis=-1) for shift in (-half, half)
+    ]
+    speed = np.linalg.norm(ends[1] - ends[0], axis=-1) / (2 * half)
+    return readings[inside][speed > faster_than]
