@@ -13,6 +13,7 @@ from drivers.sim.finger import FingerView
 from drivers.sim.gel_optics import GelSlimOptics
 from drivers.sim.gelslim import SimGelSlim
 from estimation.tactile_pose import FingerModel, TactilePoseEstimator
+from experiments.bench import tactile
 from experiments.bench.tactile import Family, Grasp, Hand
 from mechanics import se2
 from mechanics.polygon import Polygon
@@ -75,6 +76,12 @@ def open_gelslim(
 
 def methods(model: FingerModel, outline: Polygon) -> Sequence[TactilePoseEstimator]:
     """The ways to read a gel's picture."""
+    from estimation.gel_contact import GelContact
     from estimation.tactile_pose_gel import TactilePoseGel
+    from estimation.tactile_pose_icp import CannyIcp
 
-    return (TactilePoseGel(model, outline),)
+    return CannyIcp(model, outline, GelContact(model).read), TactilePoseGel(model, outline)
+
+
+#: all families of the table, this one among them
+FAMILIES: dict[str, Family] = {**tactile.FAMILIES, "gelslim": gelslim()}

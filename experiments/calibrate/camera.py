@@ -29,6 +29,8 @@ BOARD = TagBoard()
 TILT, NEAR, FAR = np.radians(35.0), 0.75, 1.1
 #: largest turn of the object before the camera [rad], and how much of the picture its poses fill
 TURN, FILLED = np.radians(25.0), 0.5
+#: longest wait for a picture [s]: a board full of tags takes its time
+PATIENCE = 10.0
 
 
 def camera_stage(context: RunContext, stage: CameraStage) -> None:
@@ -136,7 +138,7 @@ def _averaged(rig: Rig, frames: int) -> list[TagDetection]:
     seen: dict[int, list[TagDetection]] = {}
     last: Status = Status.OK
     for _ in range(frames):
-        reading = camera.capture()
+        reading = camera.capture(timeout=PATIENCE)
         last = reading.stamp.status
         if last is Status.OK:
             for detection in reading.detections:

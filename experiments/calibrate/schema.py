@@ -85,7 +85,7 @@ class CameraStage(_Model):
     stage: Literal["calibrate_camera"]
     views: int = Field(default=20, ge=1, le=200, description="poses of the board")
     poses: int = Field(default=16, ge=1, le=200, description="poses of the arm")
-    frames: int = Field(default=4, ge=1, le=100, description="pictures averaged at each")
+    frames: int = Field(default=1, ge=1, le=100, description="pictures averaged at each")
 
 
 class ClockStage(_Model):
