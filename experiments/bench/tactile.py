@@ -98,10 +98,11 @@ class Family:
 class Row:
     """One method's line of the table; `accuracy` says of what.
 
-    ``rms_mm`` per observed axis and ``rms_deg``; ``far`` is the share of grasps beyond `FAR` or `FAR_TURNED`, or
-    without a pose; ``nees_median`` is over the median of χ², ``nees_mean`` over the dimensions; ``flagged`` the share
-    of the truly unobserved directions that were said to be, ``open`` how many directions a grasp leaves open in the
-    mean. ``ms`` is per frame of one finger.
+    ``rms_mm`` per observed axis and ``rms_deg``, over the observed directions of the poses that were given; ``far`` is
+    the share of them beyond `FAR` or `FAR_TURNED`, ``silent`` that of the grasps without a pose. ``nees_median`` is
+    over the median of χ², ``nees_mean`` over the dimensions; ``flagged`` is the share of the truly unobserved
+    directions that were said to be, ``open`` how many directions a grasp leaves open in the mean. ``ms`` is per frame
+    of one finger.
     """
 
     method: str
@@ -109,6 +110,7 @@ class Row:
     rms_mm: float
     rms_deg: float
     far: float
+    silent: float
     nees_median: float
     nees_mean: float
     flagged: float
@@ -148,7 +150,9 @@ class Estimate:
     ms: float
 
 
-def estimates(sensor: str, grasps: Sequence[Grasp], seed: int, families: dict[str, Family] | None = None):
+def estimates(
+    sensor: str, grasps: Sequence[Grasp], seed: int, families: dict[str, Family] | None = None
+) -> dict[str, list[Estimate]]:
     """What each method of a ``sensor`` family says of each grasp: {method: [Estimate]}, two fingers fused."""
     family = (families or FAMILIES)[sensor]
     hand = Hand(load_profile("lab"))
@@ -187,7 +191,7 @@ def accuracy(sensor: str, grasps: Sequence[Grasp], seed: int, families: dict[str
 
 def row(method: str, many: Sequence[Estimate], shown: Callable[[Grasp], tuple[Array, Array]]) -> Row:
     """The table's line of what a method said."""
-    squares, axes, turns, far, ratio, share = 0.0, 0, [], 0, [], []
+    squares, axes, turns, far, silent, ratio, share = 0.0, 0, [], 0, 0, [], []
     unseen, said, left_open = 0, 0, 0
     for one in many:
         error = left_difference(one.pose.pose, one.grasp.X_ee_go)
@@ -199,11 +203,12 @@ def row(method: str, many: Sequence[Estimate], shown: Callable[[Grasp], tuple[Ar
         unseen += len(truly)
         said += int((np.linalg.norm(truly @ one.pose.unobserved.T, axis=1) > 0.95).sum())
         if one.pose.status is not PoseStatus.OK:
-            far += 1
+            silent += 1
             continue
         squares += float(observed[:2] @ observed[:2])
         axes += round(float(np.trace(closed[:2, :2])))
-        turns.append(observed[2])
+        if closed[2, 2] > 0.5:
+            turns.append(observed[2])
         far += bool(np.hypot(*observed[:2]) > FAR or abs(observed[2]) > FAR_TURNED)
         if basis.shape[1]:
             scaled = basis.T @ (error * _AXES)
@@ -216,7 +221,8 @@ def row(method: str, many: Sequence[Estimate], shown: Callable[[Grasp], tuple[Ar
         len(many),
         1e3 * float(np.sqrt(squares / max(axes, 1))),
         float(np.degrees(np.sqrt(np.mean(np.square(turns))))) if turns else np.nan,
-        far / len(many),
+        far / max(len(many) - silent, 1),
+        silent / len(many),
         float(np.median(ratio)) if ratio else np.nan,
         float(np.mean(share)) if share else np.nan,
         said / unseen if unseen else 1.0,
@@ -274,15 +280,15 @@ FAMILIES: dict[str, Family] = {"soft_bubble": soft_bubble(), "soft_bubble 640×4
 
 def table(rows: Sequence[Row]) -> str:
     """The rows as text."""
-    head = f"{'method':<28}{'n':>5}{'mm':>8}{'deg':>8}{'far %':>8}{'NEES~':>8}{'NEES/d':>8}{'flag %':>8}{'open':>6}{'ms':>7}"
-    lines = [
-        f"{r.method:<28}{r.grasps:>5}{r.rms_mm:>8.3f}{r.rms_deg:>8.3f}{100 * r.far:>8.1f}{r.nees_median:>8.2f}"
-        f"{r.nees_mean:>8.2f}{100 * r.flagged:>8.1f}{r.open:>6.2f}{r.ms:>7.1f}"
-        for r in rows
-    ]
-    return "\n".join((head, *lines))
+    names = ("n", "mm", "deg", "far %", "silent %", "NEES~", "NEES/d", "flagged %", "open", "ms")
+    lines = [f"{'method':<28}" + "".join(f"{name:>10}" for name in names)]
+    for r in rows:
+        shares = (100 * r.far, 100 * r.silent, r.nees_median, r.nees_mean, 100 * r.flagged, r.open, r.ms)
+        figures = (r.rms_mm, r.rms_deg, *shares)
+        lines.append(f"{r.method:<28}{r.grasps:>10}" + "".join(f"{figure:>10.3g}" for figure in figures))
+    return "\n".join(lines)
 
 
-def combined(estimate: Estimate, finger: int) -> Estimate:
+def alone(estimate: Estimate, finger: int) -> Estimate:
     """The same grasp by one finger alone."""
     return replace(estimate, pose=estimate.fingers[finger])

@@ -18,6 +18,7 @@ from experiments.calibrate import store
 from experiments.calibrate.models import CameraCalibration
 from experiments.calibrate.rig import Rig, at_hand
 from experiments.calibrate.schema import CameraStage
+from experiments.calibrate.threads import one_thread
 from experiments.context import RunContext
 from mechanics import se2
 from mechanics.camera import CameraModel
@@ -100,7 +101,7 @@ def _lens(rig: Rig, stage: CameraStage, start: CameraModel, rng: np.random.Gener
             context.check_interrupt()
             advance()
     rig.put_board_away()
-    with context.progress.step("fit the lens"):
+    with context.progress.step("fit the lens"), one_thread():
         return fit_camera(BOARD.points(), views, start)
 
 
@@ -128,7 +129,7 @@ def _place(rig: Rig, stage: CameraStage, camera: CameraModel, rng: np.random.Gen
             sag = se2.between(ee, se2.compose(rig.hanging(ee), known.grasp))
             views.append(HandEyeView(ee, tuple(_averaged(rig, stage.frames)), sag))
             advance()
-    with rig.context.progress.step("fit the camera's place"):
+    with rig.context.progress.step("fit the camera's place"), one_thread():
         return fit_hand_eye(views, tags["go"], camera, table=tags["table"])
 
 

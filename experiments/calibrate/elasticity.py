@@ -13,37 +13,41 @@ import numpy as np
 from drivers.errors import DeviceFault
 from estimation.contact_wrench import wrist_covariance
 from estimation.elasticity_fit import fit_elasticity
-from estimation.finger_memory import Path
+from estimation.finger_memory import Path, size
 from experiments import setup
 from experiments.calibrate import store
 from experiments.calibrate.models import ElasticityCalibration, Matrix3, Vector3
 from experiments.calibrate.rig import Rig, at_hand
 from experiments.calibrate.samples import save_samples
 from experiments.calibrate.schema import ElasticityStage
+from experiments.calibrate.threads import one_thread
 from experiments.context import RunContext
 from mechanics import se2, wrench
-from mechanics.readings import Array, Status
+from mechanics.readings import Array
 from mechanics.task_plane import TaskPlane
 
 #: how often the fixed object is looked at
 LOOKS = 20
-#: time over which a sample's wrench is averaged [s]
-AVERAGED = 0.1
+#: how far a via point lies off, as a share of the amplitudes, and which holds are long ones
+VIA, LONG = 0.5, 20
 #: what a tare leaves of the wrist sensor's drift while the samples are taken, 1 sigma [N, N, N·m], and the order of
 #: the polynomial in time that it may follow
-DRIFT, DRIFT_ORDER = (0.02, 0.02, 0.004), 3
+DRIFT, DRIFT_ORDER = (0.02, 0.02, 0.004), 8
+#: how well the arm repeats itself, 1 sigma of a hold [m, m, rad]: what the makers of such arms warrant
+POSE_NOISE = (1e-4, 1e-4, np.radians(0.1))
 
 
 @dataclass(frozen=True, eq=False)
 class ElasticitySamples:
     """What was measured: ``x`` (n, 3) displacements of ee in gocf [m, m, rad], ``w`` (n, 3) wrenches of the sensor on
-    the object about the grasp centre, in gocf [N, N, N·m], each with ``w_covariance`` (3, 3), at ``times`` (n,) [s];
-    and the ``path`` that the fingers went from the grasp on."""
+    the object about the grasp centre, in gocf [N, N, N·m], each with ``w_covariance`` (3, 3), at ``times`` (n,) [s] in
+    the ``holds`` (n,); and the ``path`` that the fingers were sent along from the grasp on."""
 
     x: Array
     w: Array
     w_covariance: Array
     times: Array
+    holds: Array
     path: Path
 
 
@@ -55,12 +59,19 @@ def elasticity_stage(context: RunContext, stage: ElasticityStage) -> None:
         samples = sampled(rig, stage, rng)
         rig.home()
         devices = tuple(d.name for d in (rig.devices.arm, rig.devices.force_torque("wrist"), rig.devices.camera))
-    with context.progress.step("fit the elasticity"):
+    with context.progress.step("fit the elasticity"), one_thread():
         drifting = samples.w_covariance + np.diag(DRIFT) ** 2
         fit = fit_elasticity(
-            samples.x, samples.w, w_covariance=drifting, times=samples.times, path=samples.path, drift_order=DRIFT_ORDER
+            samples.x,
+            samples.w,
+            x_covariance=np.diag(POSE_NOISE) ** 2,
+            w_covariance=drifting,
+            times=samples.times,
+            path=samples.path,
+            holds=samples.holds,
+            drift_order=DRIFT_ORDER,
         )
-    amplitude = 0.5 * fit.reach
+    amplitude = float(np.sqrt(np.mean(size(fit.stiffness, samples.x - fit.offset) ** 2)))
     found = ElasticityCalibration(
         origin=store.origin(resolved, devices, ("go",), context.folder.path.name),
         sensor=resolved.sensor.name,
@@ -96,79 +107,77 @@ def _rows(matrix: Array) -> Matrix3:
     return _three(matrix[0]), _three(matrix[1]), _three(matrix[2])
 
 
-def schedule(stage: ElasticityStage, stiffness: Array, rng: np.random.Generator) -> Array:
-    """Displacements (n, 3) [m, m, rad] in the order of the samples: to and fro along each axis, then at random.
+def schedule(stage: ElasticityStage, stiffness: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Displacements (n, 3) [m, m, rad] of the holds in their order, and the via point (n, 3) before each.
 
-    Each axis is gone through up, down and up again, so that what the membrane's hysteresis adds takes both signs.
+    The via points take every side, so that what the membrane remembers does not go with where it is.
     """
     scale = np.array([stage.force, stage.force, stage.torque]) / np.diag(stiffness)
-    per_axis, rest = divmod(stage.samples // 2, 3)
-    along = []
-    for axis in range(3):
-        count = per_axis + (axis < rest)
-        if count:
-            turn = np.abs((np.linspace(0, 4, count, endpoint=False) + 1) % 4 - 2) - 1  # triangle wave from 0
-            along.append(-turn[:, None] * np.eye(3)[axis])
-    random = rng.uniform(-1, 1, (stage.samples - sum(map(len, along)), 3))
-    return np.concatenate([*along, random]) * scale
+    along = np.zeros((stage.samples // 3, 3))
+    along[np.arange(len(along)), np.arange(len(along)) % 3] = rng.uniform(-1, 1, len(along))
+    holds = rng.permutation(np.concatenate([along, rng.uniform(-1, 1, (stage.samples - len(along), 3))])) * scale
+    direction = rng.standard_normal(holds.shape)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return holds, holds + VIA * direction * scale
 
 
 def sampled(rig: Rig, stage: ElasticityStage, rng: np.random.Generator) -> ElasticitySamples:
     """Go through the schedule and measure. Ends with the object free in the fingers again."""
-    context, observer = rig.context, rig.observer
+    context, observer, clock = rig.context, rig.observer, rig.devices.clock
     what = context.resolved.grasped.name
-    began = rig.devices.clock.now_ns()
     rig.regrasp(0)
     seen = observer.see(("go",))["go"]
     if seen is None:
         raise DeviceFault("camera", "see the object", "its tag is not in view", "Bring the object's tag into view")
     observer.zero(setup.free_air_load(context.resolved), seen.pose)
+    way = [(clock.now_ns(), rig.mover.pose)]
     rig.clamp("go", what)
     X_W_gocf = se2.compose(_looked(rig), observer.grasp)
-    x, w, covariances, times = [], [], [], []
-    trace = _Trace(rig, began)
-    targets = schedule(stage, context.believed.stiffness, rng)
-    with context.progress.steps("elasticity samples", len(targets)) as advance:
-        for target in targets:
-            rig.mover.ramp(se2.compose(X_W_gocf, target), stage.ramp)
-            rig.rest(stage.dwell)
-            reading, covariance = rig.wrist_samples(AVERAGED)
-            times.append(rig.devices.clock.now_ns() * 1e-9 - AVERAGED / 2)
-            ee = observer.arm_pose()
-            trace.follow()
-            x.append(se2.between(X_W_gocf, ee))
-            on_go = observer.wrist_sensor.wrench_on_go(reading, ee, X_W_gocf[:2])
-            w.append(wrench.rotated(on_go, -X_W_gocf[2]))
-            covariances.append(_covariance_in_gocf(covariance, observer.wrist_sensor.X_ee_s, ee, X_W_gocf))
+    x, w, covariances, times, numbers = [], [], [], [], []
+    holds, vias = schedule(stage, context.believed.stiffness, rng)
+
+    def move(target: Array) -> None:
+        way.append((clock.now_ns(), rig.mover.pose))
+        rig.mover.ramp(se2.compose(X_W_gocf, target), stage.ramp)
+        way.append((clock.now_ns(), rig.mover.pose))
+
+    def read(number: int) -> None:
+        reading, covariance = rig.wrist_samples(stage.dwell / 3)
+        times.append(clock.now_ns() * 1e-9 - stage.dwell / 6)
+        ee = observer.arm_pose()
+        x.append(se2.between(X_W_gocf, ee))
+        on_go = observer.wrist_sensor.wrench_on_go(reading, ee, X_W_gocf[:2])
+        w.append(wrench.rotated(on_go, -X_W_gocf[2]))
+        covariances.append(_covariance_in_gocf(covariance, observer.wrist_sensor.X_ee_s, ee, X_W_gocf))
+        numbers.append(number)
+
+    with context.progress.steps("elasticity samples", len(holds)) as advance:
+        for number, (via, hold) in enumerate(zip(vias, holds, strict=True)):
+            move(via)
+            move(hold)
+            read(number)
+            rig.rest((stage.long_dwell if number % LONG == LONG - 1 else stage.dwell) - 2 * stage.dwell / 3)
+            read(number)
             advance()
+    way.append((clock.now_ns() + 1, rig.mover.pose))
     rig.mover.ramp(se2.compose(X_W_gocf, np.zeros(3)), 0.5)
     rig.free(what)
     rig.rest(0.5)
-    path = trace.path(X_W_gocf)
-    return ElasticitySamples(np.array(x), np.array(w), np.mean(covariances, axis=0), np.array(times), path)
+    held = np.array(numbers)
+    both = np.array(x)
+    for number in range(len(holds)):  # one displacement a hold, by all that was seen of it
+        both[held == number] = both[held == number].mean(axis=0)
+    return ElasticitySamples(
+        both, np.array(w), np.mean(covariances, axis=0), np.array(times), held, _path(way, X_W_gocf)
+    )
 
 
-class _Trace:
-    """Where the arm has been since the grasp, by its own readings."""
-
-    def __init__(self, rig: Rig, since_ns: int):
-        self._arm, self._last = rig.devices.arm, since_ns
-        self._times: list[float] = []
-        self._poses: list[Array] = []
-        self.follow()
-
-    def follow(self) -> None:
-        """Take in the readings since the last call; a device keeps the newest only."""
-        for reading in self._arm.since(self._last):
-            self._last = reading.stamp.capture_ns
-            if reading.stamp.status is Status.OK:
-                self._times.append(self._last * 1e-9)
-                self._poses.append(reading.pose)
-
-    def path(self, X_W_gocf: Array) -> Path:
-        """The whole way, as displacements in gocf."""
-        poses = np.array(self._poses)
-        return Path(np.array(self._times), se2.between(np.broadcast_to(X_W_gocf, poses.shape), poses))
+def _path(way: list[tuple[int, Array]], X_W_gocf: Array) -> Path:
+    """The set-points as displacements in gocf; where two fall on one instant the later one stands."""
+    points = dict(way)
+    instants = sorted(points)
+    poses = np.array([points[t] for t in instants])
+    return Path(np.array(instants) * 1e-9, se2.between(np.broadcast_to(X_W_gocf, poses.shape), poses))
 
 
 def _looked(rig: Rig) -> Array:

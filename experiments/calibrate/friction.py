@@ -18,6 +18,7 @@ from experiments.calibrate.rig import Rig, at_hand
 from experiments.calibrate.samples import save_samples
 from experiments.calibrate.schema import FrictionStage
 from experiments.calibrate.strokes import Dragged, drawn, stroked
+from experiments.calibrate.threads import one_thread
 from experiments.context import RunContext
 from mechanics.catalogue import ObjectModel
 from mechanics.readings import Array
@@ -47,7 +48,8 @@ def friction_stage(context: RunContext, stage: FrictionStage) -> None:
         _restored(rig, stage)
         rig.home()
     samples = np.concatenate(forces)
-    fit = fit_friction(samples)
+    with one_thread():
+        fit = fit_friction(samples)
     roles = tuple(body for body in stage.pair.split("-") if body != "ground")
     table = rig.devices.force_torque("table").name
     found = FrictionCalibration(
@@ -55,7 +57,7 @@ def friction_stage(context: RunContext, stage: FrictionStage) -> None:
         pair=stage.pair,
         mu=fit.mu,
         interval=fit.interval,
-        samples=len(samples),
+        samples=fit.samples,
     )
     save_samples(context, found.name, {"f_n": samples[:, 0], "f_t": samples[:, 1]})
     context.calibrated(found)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drivers.errors import ProtocolError
 from drivers.wire.log_reader import LogReader
-from experiments.files import load
+from experiments.calibrate.models import friction_name
+from experiments.calibrate.samples import load_samples
+from experiments.calibrate.store import prints
+from experiments.files import Resolved, load
 from experiments.paper import beside
 from experiments.run_folder import RunFolder
 from mechanics import se2
@@ -47,6 +52,7 @@ def collect(folder: RunFolder) -> dict[str, Any]:
     """
     resolved = load(str(folder.experiment))
     results = json.loads(folder.results.read_text("utf-8")) if folder.results.is_file() else {}
+    known = results.get("calibration") or {}
     log = _read(folder, resolved.experiment.report.playback_rate)
     bodies = {"go": resolved.grasped, "eo": resolved.extrinsic}
     return {
@@ -69,7 +75,48 @@ def collect(folder: RunFolder) -> dict[str, Any]:
         },
         "events": [{"t": event.capture_ns * SECOND, "level": event.level, "text": event.text} for event in log.events],
         "paper": beside(results.get("trials", [])),
+        "calibration": {
+            "made": [file.stem for file in sorted(folder.calibration.glob("*.yaml")) if file.stem in known],
+            "samples": {file.stem: _samples(file) for file in sorted(folder.calibration.glob("*.csv"))},
+            "nominal": _nominal(resolved),
+            "only": all(stage.stage.startswith("calibrate_") for stage in resolved.experiment.stages),
+        },
     }
+
+
+def _samples(file: Path) -> dict[str, Any] | str:
+    """Columns by name, or what is wrong with the file."""
+    try:
+        return load_samples(file)
+    except (OSError, ValueError, csv.Error):
+        return "it is no table of numbers"
+
+
+def _nominal(resolved: Resolved) -> list[dict[str, Any]]:
+    """What a run takes for true until it is calibrated, by the calibration that would say otherwise."""
+    go, sensor, objects = resolved.grasped.name, resolved.sensor, prints(resolved)
+    of = {body: print_.split()[0] for body, print_ in objects.items()}
+    frictions = [
+        {
+            "name": friction_name(pair, objects),
+            "kind": "friction",
+            "of": " on ".join(of.get(body, body) for body in pair.split("-")),
+            "figures": [mu],
+        }
+        for pair, mu in resolved.friction.items()
+    ]
+    stiffness = np.diag(sensor.stiffness).tolist()
+    return [
+        {
+            "name": f"elasticity-{sensor.name}-{go}",
+            "kind": "elasticity",
+            "of": f"{sensor.name} on {go}",
+            "figures": stiffness,
+        },
+        *frictions,
+        *({"name": kind, "kind": kind} for kind in ("force_torque", "camera", "clock")),
+        {"name": f"tag-{go}", "kind": "tag", "of": go},
+    ]
 
 
 def _read(folder: RunFolder, rate: float) -> _Log:

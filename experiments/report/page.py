@@ -7,7 +7,9 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from experiments.report import payload, summary, traces
+from experiments.report import calibration, calibration_table, payload, summary, traces
+
+SCRIPTS = ("paper.js", "scene.js", "player.js", "plots.js", "traces.js", "calibration.js")
 
 
 def render(data: Mapping[str, Any]) -> str:
@@ -16,7 +18,8 @@ def render(data: Mapping[str, Any]) -> str:
     ``data`` is JSON-able: ``results`` (results.json), ``title``, ``created``, ``objects`` (outlines in body frames
     [m]), ``grasp`` X_go_gocf, ``trials`` (waypoints and playback: poses (x, y, θ) in W, wrenches (fx, fy, τ) of the
     sensor on the go about the grasp centre, axes of W, contacts with point and force in W; SI), ``log``, ``events``,
-    ``paper`` (see `summary.error_table`). What is missing, None or NaN is left out and the page says so, so that an
+    ``paper`` (see `summary.error_table`), ``calibration`` (see `calibration_table.section`; ``only``: the run was to do
+    nothing else). What is missing, None or NaN is left out and the page says so, so that an
     aborted, empty or torn run has its report as well. Raises TypeError when ``data`` is no mapping.
     """
     if not isinstance(data, Mapping):
@@ -24,18 +27,25 @@ def render(data: Mapping[str, Any]) -> str:
     data = payload.clean(data)
     found = data.get("results")
     results: dict[str, Any] = found if isinstance(found, dict) else {}
-    carried = payload.build(data)
+    run = summary.mapping(data.get("calibration"))
+    known = calibration_table.section(results.get("calibration"), run)
+    drawn = known["figures"] if known else []
+    drawings = payload.encode({"figures": [_drawing(figure) for figure in drawn], "styles": calibration.styles()})
+    carried = payload.build(data, reserved=len(drawings) if drawn else 0)
     carried["figures"] = [traces.figure(trial) for trial in carried["trials"]]
     carried["styles"] = traces.styles()
     plotted = any(figure is not None for figure in carried["figures"])
+    only_calibrates = bool(run.get("only")) and not carried["trials"] and not results.get("trials")
+    made = run.get("made")
     provenance = results.get("provenance")
     return _template().render(
         title=str(data.get("title") or "Untitled run"),
-        verdict=summary.verdict(results),
+        verdict=summary.verdict(results, len(made) if only_calibrates and isinstance(made, list) else None),
         facts=summary.facts(data),
         table=summary.error_table(results, data.get("paper")),
         plans=summary.plan_rows(results),
-        calibration=list(summary.leaves(results.get("calibration") or {})),
+        calibration=known,
+        only_calibrates=only_calibrates,
         provenance=list(summary.leaves(provenance)) if provenance else [],
         log=summary.log_summary(data.get("log"), len(results.get("trials") or [])),
         events=summary.event_rows(data.get("events")),
@@ -43,10 +53,15 @@ def render(data: Mapping[str, Any]) -> str:
         playable=any(trial["playback"] is not None for trial in carried["trials"]),
         plotted=plotted,
         data=payload.encode(carried),
+        drawings=drawings,
         style=_text("style.css"),
-        scripts={name: _text(name) for name in ("scene.js", "player.js", "traces.js")},
-        plotly=_plotly() if plotted else "",
+        scripts={name: _text(name) for name in SCRIPTS},
+        plotly=_plotly() if plotted or drawn else "",
     )
+
+
+def _drawing(figure: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: figure[key] for key in ("data", "layout", "wide")}
 
 
 def _text(name: str) -> str:

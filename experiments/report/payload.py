@@ -46,8 +46,11 @@ def encode(value: Any) -> str:
     return text
 
 
-def build(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The page's data: objects (outlines, body frame), grasp X_go_gocf, and per trial its waypoints and playback."""
+def build(data: Mapping[str, Any], reserved: int = 0) -> dict[str, Any]:
+    """The page's data: objects (outlines, body frame), grasp X_go_gocf, and per trial its waypoints and playback.
+
+    ``reserved``: bytes of the budget that the page needs for other things.
+    """
     objects = _mapping(data.get("objects"))
     trials = [_mapping(trial) for trial in _list(data.get("trials"))]
     out = {
@@ -56,7 +59,7 @@ def build(data: Mapping[str, Any]) -> dict[str, Any]:
         "modes": MODES,
         "trials": [_trial(trial) for trial in trials],
     }
-    _thin(out["trials"])
+    _thin(out["trials"], BUDGET - reserved)
     return out
 
 
@@ -215,11 +218,11 @@ def _trial(trial: Mapping[str, Any]) -> dict[str, Any]:
     return {**text, "waypoints": waypoints, "playback": _playback(trial.get("playback"), waypoints)}
 
 
-def _thin(trials: list[dict[str, Any]]) -> None:
+def _thin(trials: list[dict[str, Any]], budget: int) -> None:
     """Thin the frames evenly where all playbacks together exceed the budget; the page says how many are shown."""
     playbacks = [trial["playback"] for trial in trials if trial["playback"] is not None]
     size = sum(len(encode(playback)) for playback in playbacks)
-    room = BUDGET - sum(len(encode(trial["waypoints"])) + FIGURE for trial in trials)
+    room = budget - sum(len(encode(trial["waypoints"])) + FIGURE for trial in trials)
     if size <= room:
         return
     for playback in playbacks:

@@ -203,14 +203,6 @@ const Player = (() => {
   $("trial").addEventListener("change", () => choose(Number($("trial").value)));
   for (const id of ["show-plan", "show-forces"]) $(id).addEventListener("change", draw);
 
-  // On paper nothing opens on a click.
-  let closed = [];
-  addEventListener("beforeprint", () => {
-    closed = [...document.querySelectorAll("details:not([open])")];
-    for (const details of closed) details.open = true;
-  });
-  addEventListener("afterprint", () => { for (const details of closed) details.open = false; closed = []; });
-
   choose(0);
   return {
     data, seek, choose,

@@ -41,12 +41,19 @@ def words(status: Any) -> str:
     return str(status).replace("_", " ") if status else "unknown"
 
 
-def verdict(results: Mapping[str, Any]) -> Verdict:
-    """The verdict of a run from its results.json (design §6, §7): the run's own status and those of its trials."""
+def verdict(results: Mapping[str, Any], calibrations: int | None = None) -> Verdict:
+    """The verdict of a run from its results.json (design §6, §7): the run's own status and those of its trials.
+
+    ``calibrations``: how many were made, for a run that was to make nothing else.
+    """
     trials = _trials(results)
     status = str(results.get("status") or "")
     done = sum(trial.get("status") in COMPLETED for trial in trials)
     count = f"{done} of {len(trials)} trial{'s' * (len(trials) != 1)} completed" if trials else "no trial was executed"
+    if calibrations is not None and not trials:
+        count = (
+            f"{calibrations or 'no'} calibration{'s' * (calibrations > 1)} {'were' if calibrations > 1 else 'was'} made"
+        )
     reason = str(results.get("reason") or "").strip().rstrip(".")
     tail = f": {reason}." if reason else "."
     failed = next((trial for trial in trials if trial.get("status") in ABORTING), None)
@@ -70,11 +77,11 @@ def level(status: Any) -> str:
 
 def facts(data: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Label and value of what identifies the run; a fact that was not recorded says so."""
-    results = _mapping(data.get("results"))
-    station, provenance = results.get("station"), _mapping(results.get("provenance"))
-    world = _mapping(_mapping(station).get("world"))
-    profile = results.get("profile") or _mapping(station).get("profile") or world.get("profile")
-    name = _mapping(station).get("name") if isinstance(station, Mapping) else station
+    results = mapping(data.get("results"))
+    station, provenance = results.get("station"), mapping(results.get("provenance"))
+    world = mapping(mapping(station).get("world"))
+    profile = results.get("profile") or mapping(station).get("profile") or world.get("profile")
+    name = mapping(station).get("name") if isinstance(station, Mapping) else station
     seed = results.get("seed")
     pairs = [
         ("Experiment", _name(results.get("experiment"))),
@@ -104,7 +111,7 @@ def error_table(results: Mapping[str, Any], paper: Any = None) -> dict[str, Any]
     ``paper`` may hold ``{"source": text, "rows": {trial name: M}}``: figures of the paper to show beside.
     Each row's ``aggregates[key][source]`` and ``components[source][key]`` is (mean, std) as text, or None.
     """
-    trials, beside = _trials(results), _mapping(_mapping(paper).get("rows"))
+    trials, beside = _trials(results), mapping(mapping(paper).get("rows"))
     figures = [
         {"measured": trial.get("measured"), "truth": trial.get("truth"), "paper": beside.get(str(trial.get("name")))}
         for trial in trials
@@ -125,16 +132,16 @@ def error_table(results: Mapping[str, Any], paper: Any = None) -> dict[str, Any]
             "components": {s: {c[0]: _figure(figure[s], c[0], c[3]) for c in COMPONENTS} for s in sources},
         }
         rows.append(row)
-    source = str(_mapping(paper).get("source") or "the paper")
+    source = str(mapping(paper).get("source") or "the paper")
     return {"heads": heads, "components": COMPONENTS, "sources": sources, "rows": rows, "paper": source}
 
 
 def _has(figure: Mapping[str, Any], key: str) -> bool:
-    return any(_mapping(_mapping(m).get(key)).get("mean") is not None for m in figure.values())
+    return any(mapping(mapping(m).get(key)).get("mean") is not None for m in figure.values())
 
 
 def _figure(values: Any, key: str, decimals: int) -> tuple[str, str | None] | None:
-    entry = _mapping(_mapping(values).get(key))
+    entry = mapping(mapping(values).get(key))
     mean, std = entry.get("mean"), entry.get("std")
     if not _is_number(mean):
         return None
@@ -151,11 +158,11 @@ def log_summary(log: Any, trials: int) -> dict[str, Any] | None:
     ``ending`` other than ``complete`` says how the log broke off; it is optional, as is ``torn`` (true for one that
     was cut off somewhere).
     """
-    source = _mapping(log)
+    source = mapping(log)
     ending = str(source.get("ending") or ("the end is missing" if source.get("torn") else "complete"))
     if not source or not (source.get("bytes") or source.get("messages")):
         return None
-    counts = {str(k): int(v) for k, v in _mapping(source.get("messages")).items() if _is_number(v)}
+    counts = {str(k): int(v) for k, v in mapping(source.get("messages")).items() if _is_number(v)}
     seconds, size, lost = (v if _is_number(v := source.get(key)) else None for key in ("seconds", "bytes", "lost"))
     return {
         "file": str(source.get("file") or "log.mcap"),
@@ -173,7 +180,7 @@ def event_rows(events: Any) -> list[dict[str, str]]:
     """Time [s] as text, level and words of each event, in the order given."""
     rows = []
     for event in events if isinstance(events, list | tuple) else []:
-        source = _mapping(event)
+        source = mapping(event)
         t = source.get("t")
         severity = str(source.get("level") or "info")
         rows.append(
@@ -190,7 +197,7 @@ def plan_rows(results: Mapping[str, Any]) -> list[dict[str, str]]:
     """The plans of results.json as text: name, skill, planner, steps, queries, time, loss, status."""
     keys = ("name", "skill", "planner", "steps", "queries", "time_s", "loss", "status")
     found = results.get("plans")
-    plans = [_mapping(plan) for plan in found] if isinstance(found, list) else []
+    plans = [mapping(plan) for plan in found] if isinstance(found, list) else []
     return [{key: f"{v:.4g}" if isinstance(v := plan.get(key), float) else _plain(v) for key in keys} for plan in plans]
 
 
@@ -218,10 +225,11 @@ def _plain(value: Any) -> str:
     return str(value)
 
 
-def _mapping(value: Any) -> Mapping[str, Any]:
+def mapping(value: Any) -> Mapping[str, Any]:
+    """``value`` where it is a mapping, else an empty one: what a torn file does not hold."""
     return value if isinstance(value, Mapping) else {}
 
 
 def _trials(results: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     trials = results.get("trials")
-    return [_mapping(trial) for trial in trials] if isinstance(trials, list | tuple) else []
+    return [mapping(trial) for trial in trials] if isinstance(trials, list | tuple) else []

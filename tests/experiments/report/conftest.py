@@ -149,6 +149,83 @@ def errors(trial, source):
     return out
 
 
+def origin(run="calibrate-20251120T080000", **objects):
+    return {"made": "2025-11-20T08:15:00Z", "station": "sim", "world": None, "devices": {"wrist_ft": "sim"},
+            "objects": objects, "run": run, "revision": "25914cc0a7d2"}  # fmt: skip
+
+
+def friction_entry(mu=0.33, interval=(0.32, 0.34), pair="go-ground", **objects):
+    """A friction calibration as results.json has it."""
+    made = origin(**(objects or {"go": "tall_box d065ea75"}))
+    return {"file": f"calibrations/lab-1/friction-{pair}.yaml", "kind": "friction", "origin": made, "pair": pair,
+            "mu": mu, "interval": list(interval), "samples": 400}  # fmt: skip
+
+
+def elasticity_entry():
+    """An elasticity calibration of soft_bubble on tall_box as results.json has it; K is the paper's."""
+    deviation = np.array([[9.4, 6.2, 0.31], [6.2, 8.8, 0.28], [0.31, 0.28, 0.021]])
+    return {
+        "file": "calibrations/lab-1/elasticity-soft_bubble-tall_box.yaml", "kind": "elasticity",
+        "origin": origin(go="tall_box d065ea75"), "sensor": "soft_bubble", "stiffness": K.tolist(),
+        "deviation": deviation.tolist(), "amplitude": 0.002, "initial": (0.96 * K).tolist(), "stiffening": 20.0,
+        "hysteresis": 0.12, "yield_length": 0.0006, "creep": 0.0, "creep_time": 0.0, "offset": [1e-4, -2e-4, 0.004],
+        "residual": [0.08, 0.07, 0.003], "chi2": 1.04, "method": "errors_in_variables", "samples": 200,
+    }  # fmt: skip
+
+
+def elasticity_samples(count=200, seed=0, noise=0.1):
+    """Columns of samples that follow w = K x but for ``noise`` [N, N, 0.1 N·m], half along the axes, half at random."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-1, 1, (count, 3)) * [0.003, 0.003, 0.06]
+    for axis in range(3):
+        x[axis * count // 6 : (axis + 1) * count // 6, np.arange(3) != axis] = 0
+    fit = x @ K
+    w = fit + noise * rng.normal(size=(count, 3)) * [1, 1, 0.1]
+    names = ("x", "y", "theta", "fx", "fy", "tau", "fx_fit", "fy_fit", "tau_fit")
+    return {"time": np.arange(count) * 0.5, **dict(zip(names, np.concatenate([x, w, fit], axis=1).T, strict=True))}
+
+
+def friction_samples(mu=0.33, count=400, seed=0):
+    """Columns of forces that fill a cone of ``mu``, half of them on its edges."""
+    rng = np.random.default_rng(seed)
+    f_n = rng.uniform(1, 6, count)
+    share = np.where(rng.random(count) < 0.5, np.sign(rng.normal(size=count)), rng.uniform(-1, 1, count))
+    return {"f_n": f_n + 0.02 * rng.normal(size=count), "f_t": mu * f_n * share + 0.02 * rng.normal(size=count)}
+
+
+def build_calibrated():
+    """A run that did nothing but calibrate, each kind once and friction for three pairs."""
+    go, eo = "tall_box d065ea75", "hbox 11aa22bb"
+    lens = [[1400.5, 0.0, 640.0], [0.0, 1401.0, 512.0], [0.0, 0.0, 1.0]]
+    known = {
+        "force_torque": {"kind": "force_torque", "origin": origin(), "device": "wrist_ft", "tool_mass": 1.2034,
+                         "tool_centre": [0.0012, 0.0641], "deviation": [0.0021, 0.0003, 0.0004], "residual": 0.031,
+                         "samples": 9},
+        "camera": {"kind": "camera", "origin": origin(), "device": "camera", "focal_deviation": 1.3,
+                   "camera": {"width": 1280, "height": 1024, "K": lens, "distortion": [0.0] * 5,
+                              "X_WC": np.eye(4).tolist()}, "residual_px": 0.21, "views": 24},
+        "tag-tall_box": {"kind": "tag", "origin": origin(go=go), "id": 3, "pose": [0.0004, 0.0201, 0.0087266],
+                         "deviation": [0.00011, 0.00012, 0.0017453]},
+        "clock": {"kind": "clock", "origin": origin(), "delays": {"wrist": {"delay": 0.00213, "deviation": 0.00054},
+                                                                  "camera": {"delay": 0.0121, "deviation": 0.0011}}},
+    }  # fmt: skip
+    for name, entry in known.items():
+        entry["file"] = f"calibrations/lab-1/{name}.yaml"
+    known["elasticity-soft_bubble-tall_box"] = elasticity_entry()
+    known["friction-tall_box-ground"] = friction_entry()
+    known["friction-tall_box-hbox"] = friction_entry(0.52, (0.49, 0.55), "go-eo", go=go, eo=eo)
+    known["friction-hbox-ground"] = friction_entry(0.21, (0.205, 0.215), "eo-ground", eo=eo)
+    samples = {name: friction_samples(entry["mu"], seed=7) for name, entry in known.items() if "mu" in entry}
+    run = build_run([])
+    run["title"] = run["results"]["experiment"] = "calibrate"
+    run["results"]["calibration"] = known
+    run["calibration"] = {
+        "made": list(known), "samples": {"elasticity-soft_bubble-tall_box": elasticity_samples(), **samples},
+        "nominal": [], "only": True,
+    }  # fmt: skip
+    return run
+
+
 def build_run(trials, status="completed", eo=False):
     rows = [
         {
@@ -168,7 +245,7 @@ def build_run(trials, status="completed", eo=False):
                 "versions": {"extrinsic": "0.1.0", "mujoco": "4.0.0", "numpy": "2.4.6", "python": "3.11.9"},
                 "host": {"name": "bench-2", "cpu": "2 cores"},
             },
-            "calibration": {"stiffness": K.tolist(), "friction": {"go-ground": 0.33}},
+            "calibration": {"friction-tall_box-ground": friction_entry()},
             "plans": [{"name": "pivot", "skill": trials[0]["skill"], "planner": "gradient", "steps": 20, "queries": 100,
                        "time_s": 7.19, "loss": 0.00231, "status": "optimal"}] if trials else [],
             "trials": rows, "tables": [],
@@ -246,6 +323,12 @@ def empty():
 
 
 @pytest.fixture
+def calibrated():
+    """A run that did nothing but calibrate: all kinds, three pairs, samples beside those that have a figure."""
+    return build_calibrated()
+
+
+@pytest.fixture
 def editable(grasped):
     """A copy of the grasped run that a test may change."""
     return copy.deepcopy(grasped)
@@ -289,6 +372,12 @@ def find_cells():
         return [[" ".join(cell.split()) for cell in row] for row in parser.rows[head:]]
 
     return find
+
+
+@pytest.fixture(scope="session")
+def make_samples():
+    """The function that makes up the samples of an elasticity."""
+    return elasticity_samples
 
 
 @pytest.fixture(scope="session")

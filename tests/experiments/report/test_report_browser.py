@@ -118,6 +118,53 @@ def test_the_page_is_quiet_asks_for_nothing_and_fits(request, show, name, width,
         assert table.evaluate("box => box.scrollWidth - box.clientWidth") <= 1, table.inner_text()
 
 
+def draw_calibrations(page):
+    for plot in page.locator(".calibration-plot").all():
+        plot.scroll_into_view_if_needed()
+        plot.locator(".scatterlayer .trace").first.wait_for(state="attached")
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (800, "dark")])
+def test_a_page_that_only_calibrates_is_quiet_and_fits(show, calibrated, width, scheme):
+    page = show(calibrated, width, scheme)
+    draw_calibrations(page)
+    assert page.locator(".calibration-plot").count() == 4
+    assert page.heard == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    for table in page.locator(".scroll").all():
+        assert table.evaluate("box => box.scrollWidth - box.clientWidth") <= 1, table.inner_text()
+    paper = {"light": "#ffffff", "dark": "#14171a"}
+    for plot in page.locator(".calibration-plot").all():
+        assert plot.evaluate("plot => plot.layout.paper_bgcolor") == paper[scheme]
+        names = plot.locator(".legendtext").all_text_contents()
+        boxes = [text.bounding_box() for text in plot.locator(".legendtext, .annotation-text").all()]
+        assert names
+        assert len({round(box["y"]) for box in boxes[: len(names)]}) == 1  # the legend is one line, and no title in it
+        assert boxes[0]["y"] + boxes[0]["height"] <= boxes[-1]["y"] + 1
+    other = "dark" if scheme == "light" else "light"
+    page.emulate_media(color_scheme=other)
+    wait_until(page, f"document.querySelector('.calibration-plot').layout.paper_bgcolor === '{paper[other]}'")
+
+
+def test_forces_on_screen_stand_at_the_angle_of_their_cone(show, calibrated):
+    page = show(calibrated)
+    draw_calibrations(page)
+    for plot, mu in zip(page.locator("figure.friction").all(), (0.33, 0.52, 0.21), strict=True):
+        path = plot.locator(".trace path.js-line").last.get_attribute("d")
+        (x0, y0), (x1, y1) = [[float(v) for v in point.split(",")] for point in path[1:].split("L")[:2]]
+        assert abs((x1 - x0) / (y1 - y0)) == pytest.approx(mu, rel=0.02)
+
+
+def test_on_paper_calibrations_are_drawn_without_scrolling(show, calibrated):
+    page = show(calibrated)
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    for plot in page.locator(".calibration-plot").all():
+        assert plot.locator(".scatterlayer .trace").count() > 0
+        assert plot.evaluate("plot => plot.layout.width") <= 680
+    assert page.locator("details:not([open])").count() == 0
+    assert page.heard == []
+
+
 def test_the_slider_moves_the_scene(page, grasped):
     playback = grasped["trials"][0]["playback"]
     for index in (0, 70, 200, len(playback["t"]) - 1):
