@@ -26,8 +26,9 @@ Picture = NDArray[np.uint8] | NDArray[np.uint16]
 
 #: length by which angles are scaled where directions of a pose are compared [m]: half of what a finger sees
 ANGLE_LENGTH = 0.03
-#: a direction is unobserved when the image alone leaves a standard deviation beyond this [m, with θ scaled]
-UNOBSERVED_BEYOND = 0.002
+#: a direction is unobserved when the image alone leaves a standard deviation beyond this [m, with θ scaled]: what is
+#: called observed is then beyond 1 mm or 2° once in a hundred times at most
+UNOBSERVED_BEYOND = 0.0004
 
 
 class PoseStatus(StrEnum):

@@ -149,13 +149,13 @@ def report(
 
 @command("extrinsic bench sim --check")
 def bench(
-    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="Which benchmark: sim.")],
+    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="Which benchmark: sim, estimation.")],
     runs: Annotated[int, typer.Option("--runs", min=1, help="Measurements per figure; the median counts.")] = 5,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write BENCHMARK.json into DIR.")] = None,
     check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
 ) -> None:
-    """Measure speed, figure beside target, in one run."""
+    """Measure speed and accuracy, figure beside target, in one run."""
     from experiments import bench as benchmarks
 
     raise typer.Exit(benchmarks.main(name, runs, json_file, out, check_targets))

@@ -20,7 +20,13 @@ def _sim(runs: int) -> Iterator[figures.Figure]:
     return sim.run(runs)
 
 
-BENCHMARKS: dict[str, Callable[[int], Iterator[figures.Figure]]] = {"sim": _sim}
+def _estimation(runs: int) -> Iterator[figures.Figure]:
+    from experiments.bench import estimation
+
+    return estimation.run(runs)
+
+
+BENCHMARKS: dict[str, Callable[[int], Iterator[figures.Figure]]] = {"sim": _sim, "estimation": _estimation}
 
 
 def main(name: str, runs: int, json_file: Path | None, out: Path | None, check: bool) -> ExitCode:

@@ -59,6 +59,7 @@ class Targets(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     sim: dict[str, Target]
+    estimation: dict[str, Target]
 
 
 def targets_of(benchmark: str) -> dict[str, Target]:

@@ -1,0 +1,238 @@
+"""The kink of a Soft Bubble's membrane at the edges of a face, fitted in strips across them.
+
+Within an edge the membrane lies on the face's plane, beyond it it leaves at an angle and bends back: the pressed
+membrane's −∇²z is that of the untouched one plus what the gas adds, and along a straight edge it does not bend. So the
+height past the plane is s a − c a²/2 with a the distance from the edge: s of each strip, smooth along the edge, c of
+each edge, known but for the gas. All strips are fitted at once with the pose, by Gauss–Newton with weights that end at
+four standard deviations; what strips, edges and plane have of their own is integrated out of the pose's information.
+
+Where a membrane that leaves the face smoothly explains the pixels nearly as well, there is no edge: it is dropped.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from estimation import strip_kernels as kernels
+from estimation.alignment import Systematic
+from estimation.deformation import Deformation
+from estimation.tactile_pose import FingerModel, GraspPrior, left_difference, left_moved
+from mechanics import se2
+from mechanics.polygon import Polygon
+from mechanics.readings import Array
+
+#: how far inside and outside an edge the kink is fitted, and how near its ends not [m]
+WITHIN, OUTSIDE, CORNER = 3.5e-3, 4.5e-3, 1.5e-3
+#: width of a strip [m]
+WIDTH = 2e-3
+#: least slope with which the membrane leaves an edge that counts
+LEAST_SLOPE = 0.08
+#: standard deviation of the slopes' second difference from strip to strip, and (1, −2, 1)ᵀ (1, −2, 1)
+SLOPE_BEND, BEND = 0.05, np.outer((1.0, -2.0, 1.0), (1.0, -2.0, 1.0))
+#: a slope to begin with
+USUAL_SLOPE = 0.3
+#: by how much the gas curves the membrane more than it was [1/m], how far that may be from it, and an edge's own
+PRESSURE, PRESSURE_SPREAD, CURVATURE_SPREAD = 45.0, 30.0, 20.0
+#: what is left of the plane's offset [m] and tilt
+PLANE_SPREAD = np.array([0.1e-3, np.radians(0.3), np.radians(0.3)])
+#: by how much a kink must explain an edge's pixels better than none [logarithm of the likelihood]
+LEAST_GAIN = 12.0
+#: where a membrane without a kink may leave the face [m]
+DEPARTURES = np.arange(-3.0, 3.1, 0.5) * 1e-3
+#: the membrane is no plane and no paraboloid to better than this
+SYSTEMATIC = Systematic(offset=0.06e-3, tilt=np.radians(0.1), shift=0.03e-3, turn=np.radians(0.05))
+
+
+class KinkFit:
+    """One picture's fit in progress, from ``pose`` (3,) = X_ee_go on."""
+
+    def __init__(self, finger: FingerModel, outline: Polygon, field: Deformation, prior: GraspPrior, pose: Array):
+        self.pose = pose
+        self._finger, self._outline, self._field, self._prior = finger, outline, field, prior
+        sides = np.roll(outline.vertices, -1, axis=0) - outline.vertices
+        self._n = len(sides)
+        strips = np.ceil(np.linalg.norm(sides, axis=1) / WIDTH).astype(np.int64)
+        self._starts = np.concatenate(([0], np.cumsum(strips)))
+        self._first = 6 + 3 * self._n
+        count = int(self._starts[-1])
+        self._slopes, self._plane = np.full(count, USUAL_SLOPE), np.zeros(3)
+        self._own, self._base = np.zeros((self._n, 3)), np.zeros(self._n)
+        #: which strips have an edge to show
+        self.active = np.ones(count, bool)
+        self._seen, self._costs = np.zeros((count, 3)), np.zeros(count)
+        self._H, self._g = np.zeros((self._first + count,) * 2), np.zeros(self._first + count)
+        self._sigma = max(field.noise, 0.05e-3)
+        self._window = np.array([WITHIN, OUTSIDE, CORNER, 0.5 * field.pitch])
+        self._gather()
+
+    def solve(self) -> bool:
+        """Fit; False where no edge shows. `pose`, `active`, `information` and `kinks` are the answer."""
+        self._bend()
+        self._step(3.0)
+        self._choose()
+        if not self._enough():
+            return False
+        self._bend()
+        for widened in (2.0, 2.0, 1.4, 1.4):
+            self._move(self._step(widened))
+        self._assign()
+        self._step(1.0)
+        self._choose()
+        if not self._enough():
+            return False
+        self._bend()
+        for _ in range(2):
+            self._move(self._step(1.0))
+        for _ in range(2):
+            self.active &= self._slopes > LEAST_SLOPE
+            if not self._enough():
+                return False
+            self._move(self._step(1.0))
+        self._step(1.0)
+        if self._drop_false_edges():
+            if not self._enough():
+                return False
+            for _ in range(2):
+                self._move(self._step(1.0))
+            self._step(1.0)
+        return True
+
+    @property
+    def information(self) -> Array:
+        """Information (3, 3) of the picture alone on Δ, everything else integrated out."""
+        H = self._left
+        own = H[:3, :3] - self._prior.information
+        information = own - H[:3, 3:] @ kernels.solve_positive(H[3:, 3:].copy(), H[3:, :3].copy())
+        values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+        information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        loose = np.diag([SYSTEMATIC.shift**-2, SYSTEMATIC.shift**-2, SYSTEMATIC.turn**-2])
+        return information - information @ np.linalg.solve(information + loose, information)
+
+    @property
+    def kinks(self) -> Array:
+        """Where strips show a kink (m, 2) [m], in ee."""
+        strips = np.flatnonzero(self.active)
+        edge = np.searchsorted(self._starts, strips, side="right") - 1
+        lines = self._lines()[edge]
+        along = np.minimum((strips - self._starts[edge] + 0.5) * WIDTH, lines[:, 4])
+        outward = np.column_stack((lines[:, 3], -lines[:, 2]))
+        off = self._own[edge, 0] + self._own[edge, 1] * (along - 0.5 * lines[:, 4])
+        return lines[:, :2] + along[:, None] * lines[:, 2:4] + off[:, None] * outward
+
+    # -- pixels ------------------------------------------------------------------------------------------------------
+
+    def _gather(self) -> None:
+        """The pixels about the face, in ee."""
+        field = self._field
+        size = 2 * round(8e-3 / field.pitch) + 1
+        near = cv2.dilate(field.flat.astype(np.uint8), np.ones((size, size), np.uint8)).astype(bool) & field.valid
+        rows, columns = np.nonzero(near)
+        finger = self._finger
+        self._all = finger.in_ee(field.points(np.column_stack((columns, rows))))
+        self._all_rays = finger.in_ee(field.rays(columns, rows)) - finger.in_ee(np.zeros(2))
+        self._all_values = field.beyond[rows, columns].astype(float)
+        self._assign()
+
+    def _assign(self) -> None:
+        edges = np.empty(len(self._all), np.int64)
+        slack = 1e-3
+        kernels.nearest_edges(self._all, self._lines(), WITHIN + slack, OUTSIDE + slack, 0.5 * CORNER, edges)
+        on = edges >= 0
+        self._pixels = self._all[on], self._all_rays[on], self._all_values[on], edges[on]
+
+    def _lines(self) -> Array:
+        v = se2.transform(self.pose, self._outline.vertices)
+        side = np.roll(v, -1, axis=0) - v
+        length = np.linalg.norm(side, axis=1, keepdims=True)
+        return np.hstack((v, side / length, length))
+
+    def _choose(self) -> None:
+        """Strips that are seen on both sides and flat within."""
+        total, count, beyond = self._seen.T
+        pixels = WIDTH / self._field.pitch**2
+        mean = np.abs(total) / np.maximum(count, 1)
+        scatter = self._sigma * np.sqrt(self._field.alike / np.maximum(count, 1))
+        self.active = (count > 0.5 * pixels * WITHIN) & (beyond > 0.5 * pixels * OUTSIDE) & (mean < 1e-4 + 3 * scatter)
+
+    def _enough(self) -> bool:
+        self._constrain()
+        return self.active.sum() >= 3
+
+    def _bend(self) -> None:
+        """How the untouched membrane is curved about each edge."""
+        lines = self._lines()
+        for k in range(self._n):
+            here = np.flatnonzero(self.active[self._starts[k] : self._starts[k + 1]])
+            if len(here) and not self._base[k]:
+                middle = lines[k, :2] + lines[k, 2:4] * WIDTH * (here.mean() + 0.5)
+                self._base[k] = self._field.curvature(self._finger.in_finger(middle))
+                self._own[k] = 0.0, 0.0, self._base[k] + PRESSURE
+        self._constrain()
+
+    # -- equations ---------------------------------------------------------------------------------------------------
+
+    def _constrain(self) -> None:
+        """Which unknowns there are, and what is known of them beforehand: their information (u, u)."""
+        first, active = self._first, self.active
+        R = np.zeros_like(self._H)
+        R[(3, 4, 5), (3, 4, 5)] = PLANE_SPREAD**-2
+        edge_of = np.repeat(np.arange(self._n), np.diff(self._starts))
+        shown = np.bincount(edge_of[active], minlength=self._n) > 0
+        R[range(6, first, 3), range(6, first, 3)] = SYSTEMATIC.offset**-2
+        R[range(7, first, 3), range(7, first, 3)] = SYSTEMATIC.tilt**-2
+        curved = 8 + 3 * np.flatnonzero(shown)
+        m = len(curved)
+        R[np.ix_(curved, curved)] = np.linalg.inv(
+            PRESSURE_SPREAD**2 * np.ones((m, m)) + CURVATURE_SPREAD**2 * np.eye(m)
+        )
+        middle = 1 + np.flatnonzero(active[:-2] & active[1:-1] & active[2:] & (edge_of[:-2] == edge_of[2:]))
+        for i in range(3):
+            for j in range(3):
+                R[first + middle + i - 1, first + middle + j - 1] += BEND[i, j] * SLOPE_BEND**-2
+        strips = np.arange(first, len(R))
+        R[strips, strips] += 1.0
+        self._R = R
+        self._used = np.flatnonzero(np.concatenate((np.ones(6, bool), np.repeat(shown, 3), active)))
+
+    def _step(self, widened: float) -> Array:
+        """One Gauss–Newton step of all unknowns, residuals counting up to four ``widened`` standard deviations."""
+        points, rays, values, edges = self._pixels
+        trust = 1.0 / (self._sigma**2 * self._field.alike)
+        kernels.kink_equations(
+            points, rays, values, edges, self._lines(), self._starts, WIDTH, self._slopes, self._own, self._plane,
+            self.active, self._window, trust, 4.0 * widened * self._sigma, self._H, self._g, self._seen, self._costs
+        )  # fmt: skip
+        away = np.concatenate((np.zeros(3), self._plane, self._own.ravel(), self._slopes - USUAL_SLOPE))
+        away[8 : self._first : 3] -= self._base + PRESSURE
+        used = self._used
+        R = self._R[np.ix_(used, used)]
+        H = self._H[np.ix_(used, used)] + R
+        g = self._g[used] - R @ away[used]
+        H[:3, :3] += self._prior.information
+        g[:3] -= self._prior.information @ left_difference(self.pose, self._prior.pose)
+        self._left = H
+        step = np.zeros_like(self._g)
+        step[used] = kernels.solve_positive(H.copy(), g[:, None].copy())[:, 0]
+        return step
+
+    def _move(self, step: Array) -> None:
+        self.pose = left_moved(self.pose, step[:3])
+        self._plane = self._plane + step[3:6]
+        self._own = self._own + step[6 : self._first].reshape(-1, 3)
+        self._own[:, 2] = np.clip(self._own[:, 2], 0.0, 400.0)
+        self._slopes = np.clip(self._slopes + step[self._first :], 0.0, 1.5)
+
+    def _drop_false_edges(self) -> bool:
+        """Drop the edges whose kink explains little; whether there were any."""
+        points, rays, values, edges = self._pixels
+        smooth = np.zeros((len(self._slopes), len(DEPARTURES)))
+        kernels.departure_costs(
+            points, rays, values, edges, self._lines(), self._starts, WIDTH, self._own, self._plane, self.active,
+            self._window, 1.0 / (self._sigma**2 * self._field.alike), 4.0 * self._sigma, DEPARTURES, smooth
+        )  # fmt: skip
+        gain = np.where(self.active, smooth.min(axis=1) - self._costs, 0.0)
+        false = np.repeat(np.add.reduceat(gain, self._starts[:-1]) < LEAST_GAIN, np.diff(self._starts))
+        dropped = bool((self.active & false).any())
+        self.active &= ~false
+        return dropped

@@ -1,0 +1,253 @@
+"""Compiled loops of `estimation.kink_fit` and `estimation.tactile_pose_strips`.
+
+Pictures are float32 (rows, columns), all else float64 and int64. ``lines`` (n, 5) are the edges of an outline: first
+vertex x, y, unit direction x, y, length [m]; outside is on their right.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def ridge_scores(picture, to_pixels, points, normals, faces, poses, reach, least, cap, level, out):
+    """Score (k,) of each of ``poses`` (k, 3): how much of a ridge of ``picture`` lies under the moved outline.
+
+    ``points``, ``normals`` (m, 2) are the outline's, in its own frame; ``to_pixels`` (3, 3) takes the frame of the
+    poses to pixels. A sample's ridge is the second difference across its edge over ``reach`` [m]; it counts where the
+    picture is within ``level`` of zero on the inner side: on the face. The mean of three neighbours on one of the
+    ``faces`` (m,) counts above ``least`` and up to ``cap``.
+    """
+    rows, columns = picture.shape
+    h = to_pixels
+    for k in range(poses.shape[0]):
+        x0, y0 = poses[k, 0], poses[k, 1]
+        c, s = np.cos(poses[k, 2]), np.sin(poses[k, 2])
+        total, last, before = 0.0, 0.0, 0.0
+        for i in range(points.shape[0]):
+            px, py = points[i, 0], points[i, 1]
+            x, y = x0 + c * px - s * py, y0 + s * px + c * py
+            nx = c * normals[i, 0] - s * normals[i, 1]
+            ny = s * normals[i, 0] + c * normals[i, 1]
+            second, inner = 0.0, 0.0
+            for j in range(3):
+                qx, qy = x + (j - 1) * reach * nx, y + (j - 1) * reach * ny
+                w = h[2, 0] * qx + h[2, 1] * qy + h[2, 2]
+                u = (h[0, 0] * qx + h[0, 1] * qy + h[0, 2]) / w
+                v = (h[1, 0] * qx + h[1, 1] * qy + h[1, 2]) / w
+                if not (u >= 0.0 and v >= 0.0 and u < columns - 1 and v < rows - 1):
+                    inner = 1.0
+                    break
+                m, n = int(v), int(u)
+                fu, fv = u - n, v - m
+                value = (1 - fv) * ((1 - fu) * picture[m, n] + fu * picture[m, n + 1]) + fv * (
+                    (1 - fu) * picture[m + 1, n] + fu * picture[m + 1, n + 1]
+                )
+                second += value if j != 1 else -2.0 * value
+                if j == 0:
+                    inner = value / level
+                    if inner * inner >= 1.0:
+                        break
+            ridge = second * (1.0 - inner * inner) if inner * inner < 1.0 else 0.0
+            if i >= 2 and faces[i] == faces[i - 2]:
+                mean = (ridge + last + before) / 3.0
+                if mean > least:
+                    total += min(mean - least, cap)
+            last, before = ridge, last
+        out[k] = total
+
+
+@njit(cache=True)
+def nearest_edges(points, lines, within, outside, corner, edges):
+    """Index of each point's nearest edge into ``edges`` (m,).
+
+    −1 for points (m, 2) that are farther inside than ``within`` [m] or outside than ``outside``, or within ``corner``
+    of that edge's ends.
+    """
+    for i in range(points.shape[0]):
+        best, edge, side, place = 1e9, -1, 0.0, 0.0
+        for k in range(lines.shape[0]):
+            rx, ry = points[i, 0] - lines[k, 0], points[i, 1] - lines[k, 1]
+            along = rx * lines[k, 2] + ry * lines[k, 3]
+            across = rx * lines[k, 3] - ry * lines[k, 2]
+            past = max(0.0, -along, along - lines[k, 4])
+            distance = across * across + past * past
+            if distance < best:
+                best, edge, side = distance, k, across
+                place = min(along, lines[k, 4] - along)
+        edges[i] = edge if place > corner and -within < side < outside else -1
+
+
+@njit(cache=True)
+def kink_equations(
+    points,
+    rays,
+    values,
+    edges,
+    lines,
+    starts,
+    width,
+    slopes,
+    own,
+    plane,
+    active,
+    window,
+    trust,
+    gate,
+    H,
+    g,
+    seen,
+    costs,
+):
+    """Normal equations H (u, u), g (u,) of the kink's model, linearised at the present values.
+
+    The model at a point (m, 2) is the ``plane`` (3,) plus, outside, s a − c a²/2, with a the distance from the edge, s
+    the slope of its strip and c the curvature of its edge. ``rays`` (m, 2) is how far a point moves as its depth grows.
+    Unknowns: the pose's Δ (3), the plane (3), then (offset, tilt, c) = ``own`` (n, 3) for each edge, then s for each
+    strip. ``starts`` (n + 1,) number each edge's strips, ``width`` [m] wide, from its first vertex. ``window`` (4,)
+    [m]: how far inside and outside points count, how near an edge's ends not, how far the kink is spread. ``trust`` is
+    a point's information, ``gate`` [m] where a residual's weight ends.
+
+    ``seen`` (strips, 3): sum of the residuals within, how many, and how many points are outside; ``costs`` (strips,):
+    minus the logarithm of their likelihood.
+    """
+    n = lines.shape[0]
+    H[:] = 0.0
+    g[:] = 0.0
+    seen[:] = 0.0
+    costs[:] = 0.0
+    index = np.empty(10, np.int64)
+    J = np.empty(10)
+    soft = window[3]
+    for i in range(points.shape[0]):
+        k = edges[i]
+        x, y = points[i, 0], points[i, 1]
+        tx, ty, length = lines[k, 2], lines[k, 3], lines[k, 4]
+        along = (x - lines[k, 0]) * tx + (y - lines[k, 1]) * ty
+        if along < window[2] or along > length - window[2]:
+            continue
+        a = (x - lines[k, 0]) * ty - (y - lines[k, 1]) * tx
+        a -= own[k, 0] + own[k, 1] * (along - 0.5 * length)
+        if a < -window[0] or a > window[1]:
+            continue
+        strip = starts[k] + min(int(along / width), starts[k + 1] - starts[k] - 1)
+        s, c = slopes[strip], own[k, 2]
+        level = values[i] - plane[0] - plane[1] * x - plane[2] * y
+        if a < -2 * soft:
+            seen[strip, 0] += level
+            seen[strip, 1] += 1.0
+        elif a > 0:
+            seen[strip, 2] += 1.0
+        if not active[strip]:
+            continue
+        if a <= -soft:
+            at, step = 0.0, 0.0
+        elif a >= soft:
+            at, step = a, 1.0
+        else:
+            at, step = (a + soft) ** 2 / (4 * soft), (a + soft) / (2 * soft)
+        stretch = 1.0
+        if step > 0.0:
+            # the ray goes on past the plane: what it meets is farther out
+            lean = rays[i, 0] * ty - rays[i, 1] * tx
+            phi = at
+            for _ in range(2):
+                at -= (at - phi - lean * (s * at - 0.5 * c * at * at)) / max(1.0 - lean * (s - c * at), 0.2)
+            stretch = 1.0 / max(1.0 - lean * (s - c * at), 0.2)
+        r = level - s * at + 0.5 * c * at * at
+        rest = max(1.0 - (r / gate) ** 2, 0.0)
+        costs[strip] += trust * gate * gate / 6 * (1.0 - rest * rest * rest)
+        if rest == 0.0:
+            continue
+        weight = trust * rest * rest
+        index[0], index[1], index[2] = 3, 4, 5
+        J[0], J[1], J[2] = 1.0, x, y
+        count = 3
+        if step > 0.0:
+            # an edge that moves outward by one takes one from a
+            slope = (s - c * at) * step * stretch
+            index[3], index[4], index[5] = 0, 1, 2
+            J[3], J[4], J[5] = -slope * ty, slope * tx, slope * (ty * y + tx * x)
+            first = 6 + 3 * k
+            index[6], index[7], index[8] = first, first + 1, first + 2
+            J[6], J[7], J[8] = -slope, -slope * (along - 0.5 * length), -0.5 * at * at * stretch
+            index[9] = 6 + 3 * n + strip
+            J[9] = at * stretch
+            count = 10
+        for p in range(count):
+            wj = weight * J[p]
+            g[index[p]] += wj * r
+            for q in range(p + 1):
+                H[index[p], index[q]] += wj * J[q]
+    # the pairs were added once each, in either triangle
+    for p in range(H.shape[0]):
+        for q in range(p):
+            total = H[p, q] + H[q, p]
+            H[p, q] = total
+            H[q, p] = total
+
+
+@njit(cache=True)
+def departure_costs(
+    points, rays, values, edges, lines, starts, width, own, plane, active, window, trust, gate, places, costs
+):
+    """Cost (strips, k) of a membrane that leaves the face without a kink at ``places`` (k,) [m] beyond the edge.
+
+    The rest is as in `kink_equations`, with s = 0.
+    """
+    costs[:] = 0.0
+    for i in range(points.shape[0]):
+        k = edges[i]
+        x, y = points[i, 0], points[i, 1]
+        tx, ty, length = lines[k, 2], lines[k, 3], lines[k, 4]
+        along = (x - lines[k, 0]) * tx + (y - lines[k, 1]) * ty
+        if along < window[2] or along > length - window[2]:
+            continue
+        a = (x - lines[k, 0]) * ty - (y - lines[k, 1]) * tx
+        a -= own[k, 0] + own[k, 1] * (along - 0.5 * length)
+        if a < -window[0] or a > window[1]:
+            continue
+        strip = starts[k] + min(int(along / width), starts[k + 1] - starts[k] - 1)
+        if not active[strip]:
+            continue
+        c = own[k, 2]
+        lean = rays[i, 0] * ty - rays[i, 1] * tx
+        level = values[i] - plane[0] - plane[1] * x - plane[2] * y
+        for j in range(places.shape[0]):
+            phi = max(a - places[j], 0.0)
+            at = phi
+            for _ in range(2):
+                at -= (at - phi + lean * 0.5 * c * at * at) / (1.0 + lean * c * at)
+            rest = max(1.0 - ((level + 0.5 * c * at * at) / gate) ** 2, 0.0)
+            costs[strip, j] += trust * gate * gate / 6 * (1.0 - rest * rest * rest)
+
+
+@njit(cache=True)
+def solve_positive(A, B):
+    """X (n, k) with A X = B (n, k) for a symmetric positive definite A (n, n), by Cholesky; A and B are overwritten.
+
+    Some tens of unknowns: a threaded BLAS costs more here than it saves.
+    """
+    n, k = B.shape
+    for j in range(n):
+        for m in range(j):
+            factor = A[j, m]
+            if factor != 0.0:
+                for i in range(j, n):
+                    A[i, j] -= A[i, m] * factor
+        root = np.sqrt(A[j, j])
+        for i in range(j, n):
+            A[i, j] /= root
+    for column in range(k):
+        for i in range(n):
+            total = B[i, column]
+            for m in range(i):
+                total -= A[i, m] * B[m, column]
+            B[i, column] = total / A[i, i]
+        for i in range(n - 1, -1, -1):
+            total = B[i, column]
+            for m in range(i + 1, n):
+                total -= A[m, i] * B[m, column]
+            B[i, column] = total / A[i, i]
+    return B
