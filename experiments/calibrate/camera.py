@@ -15,9 +15,10 @@ from drivers.errors import DeviceFault
 from estimation.camera_fit import CameraFit, fit_camera
 from estimation.hand_eye import HandEyeFit, HandEyeView, fit_hand_eye
 from experiments.calibrate import store
-from experiments.calibrate.models import CameraCalibration
+from experiments.calibrate.models import CameraCalibration, TagCalibration, vector3
 from experiments.calibrate.rig import Rig, at_hand
 from experiments.calibrate.schema import CameraStage
+from experiments.calibrate.seat import seat
 from experiments.calibrate.threads import one_thread
 from experiments.context import RunContext
 from mechanics import se2
@@ -32,6 +33,8 @@ TILT, NEAR, FAR = np.radians(35.0), 0.75, 1.1
 TURN, FILLED = np.radians(25.0), 0.5
 #: longest wait for a picture [s]: a board full of tags takes its time
 PATIENCE = 10.0
+#: pictures of each touch
+SEAT_FRAMES = 4
 
 
 def camera_stage(context: RunContext, stage: CameraStage) -> None:
@@ -43,7 +46,17 @@ def camera_stage(context: RunContext, stage: CameraStage) -> None:
         start = CameraModel.from_dict(camera.describe().extra["camera"])
         lens = _lens(rig, stage, start, rng)
         place = _place(rig, stage, lens.camera, rng)
+        offset = seat(rig, place.camera, lambda: _averaged(rig, SEAT_FRAMES))
         rig.home()
+    tag = context.believed.tags["go"][0]
+    context.calibrated(
+        TagCalibration(
+            origin=store.origin(resolved, (camera.name,), ("go",), context.folder.path.name),
+            id=tag.id,
+            pose=vector3(offset.pose),
+            deviation=vector3(np.sqrt(np.diag(offset.covariance))),
+        )
+    )
     context.calibrated(
         CameraCalibration(
             origin=store.origin(resolved, (camera.name, rig.devices.arm.name), (), context.folder.path.name),

@@ -16,7 +16,7 @@ from estimation.elasticity_fit import fit_elasticity
 from estimation.finger_memory import Path, size
 from experiments import setup
 from experiments.calibrate import store
-from experiments.calibrate.models import ElasticityCalibration, Matrix3, Vector3
+from experiments.calibrate.models import ElasticityCalibration, Matrix3, vector3
 from experiments.calibrate.rig import Rig, at_hand
 from experiments.calibrate.samples import save_samples
 from experiments.calibrate.schema import ElasticityStage
@@ -84,8 +84,8 @@ def elasticity_stage(context: RunContext, stage: ElasticityStage) -> None:
         yield_length=fit.memory.yield_length,
         creep=fit.memory.creep,
         creep_time=fit.memory.creep_time,
-        offset=_three(fit.offset),
-        residual=_three(fit.residual_rms),
+        offset=vector3(fit.offset),
+        residual=vector3(fit.residual_rms),
         chi2=fit.chi2,
         method=fit.method,
         samples=fit.samples,
@@ -98,13 +98,8 @@ def elasticity_stage(context: RunContext, stage: ElasticityStage) -> None:
     context.calibrated(found)
 
 
-def _three(values: Array) -> Vector3:
-    a, b, c = values.tolist()
-    return a, b, c
-
-
 def _rows(matrix: Array) -> Matrix3:
-    return _three(matrix[0]), _three(matrix[1]), _three(matrix[2])
+    return vector3(matrix[0]), vector3(matrix[1]), vector3(matrix[2])
 
 
 def schedule(stage: ElasticityStage, stiffness: Array, rng: np.random.Generator) -> tuple[Array, Array]:

@@ -115,6 +115,12 @@ class ElasticityCalibration(_Calibration):
         return np.array(self.stiffness)
 
 
+def vector3(values: Array) -> Vector3:
+    """Three numbers of an array, as a model takes them."""
+    a, b, c = values.tolist()
+    return a, b, c
+
+
 def fingerprint(shape: ObjectModel) -> str:
     """An object's name and what tells it from another of the same name: outline and mass."""
     body = f"{shape.vertices_mm} {shape.mass:g}"

@@ -90,8 +90,9 @@ def drawn(
 def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Array:
     """Contact forces (n, 2) = (f_n, f_t) [N] on the dragged object during one stroke, in the face's axes.
 
-    From the sensor under the table: t is the normal turned by −90°. Its zero is taken just before touch-down. Before
-    the stroke the normal force is brought to what is asked, since nobody knows the grasp to the last tenth.
+    From the sensor under the table: t is the normal turned by −90°. Its zero is taken before touch-down and after the
+    stroke, and drifts evenly in between. Before the stroke the normal force is brought to what is asked, since nobody
+    knows the grasp to the last tenth.
     """
     length = abs(stroke.end - stroke.begin)
     along = np.linspace(stroke.begin, stroke.end, max(2, int(length / 0.001)))
@@ -105,39 +106,49 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Array:
     mover.travel(np.array([above[0], mover.pose[1], above[2]]))
     mover.travel(above)
     rig.rest(0.3)
-    zero, _ = rig.table_samples(0.3)
+    before = _zero(rig)
     mover.ramp(loading[0], 0.5)
     mover.through(loading, 0.5)
-    gauge = _Gauge(table.describe().extra["pose"][2] - dragged.X_W_face[2], zero)
+    angle = table.describe().extra["pose"][2] - dragged.X_W_face[2]
     deeper = np.zeros(3)
     softness = float(normal @ np.linalg.inv(dragged.stiffness[:2, :2]) @ normal)
     for _ in range(CORRECTIONS):
-        missing = stroke.force - gauge.force(rig.table_samples(0.1)[0][None])[0, 0]
+        missing = stroke.force - _contact_force(rig.table_samples(0.1)[0] - before.reading, angle)[0]
         deeper[:2] -= np.clip(missing * softness, -STEP, STEP) * normal
         mover.ramp(loading[-1] + deeper, 0.2)
     begin = rig.devices.clock.now_ns()
     mover.through(pressed + deeper, length / speed)
     readings = [r for r in table.since(begin) if r.stamp.status is Status.OK]
     mover.ramp(pressed[-1] + up, 0.5)
+    rig.rest(0.3)
+    after = _zero(rig)
     if not readings:
         raise CommandRefused(
             table.name, "measure the contact force", "no reading that can be trusted", "See to the sensor"
         )
-    forces = gauge.force(np.array([r.wrench for r in readings]))
-    bins = (np.array([r.stamp.capture_ns - readings[0].stamp.capture_ns for r in readings]) * 1e-9 / BIN).astype(int)
+    times = np.array([r.stamp.capture_ns for r in readings])
+    share = ((times - before.at_ns) / (after.at_ns - before.at_ns))[:, None]
+    zeros = before.reading + share * (after.reading - before.reading)
+    forces = _contact_force(np.array([r.wrench for r in readings]) - zeros, angle)
+    bins = ((times - times[0]) * 1e-9 / BIN).astype(int)
     means = np.array([forces[bins == b].mean(axis=0) for b in np.unique(bins)])
     return means[means[:, 0] > TOUCHED]
 
 
 @dataclass(frozen=True, eq=False)
-class _Gauge:
-    """The contact force on the object from the sensor under the table, turned by ``angle`` to the face."""
+class _Zero:
+    """What the sensor under the table reads (6,) without contact, at an instant."""
 
-    angle: float
-    zero: Array
+    reading: Array
+    at_ns: int
 
-    def force(self, wrenches: Array) -> Array:
-        """(f_n, f_t) (n, 2) on the object from the table's load (n, 6) on its sensor."""
-        planar = TaskPlane().wrench_to_planar(wrenches - self.zero)[:, :2]
-        on_object = -se2.rotate(self.angle, planar)
-        return np.column_stack([on_object[:, 1], on_object[:, 0]])
+
+def _zero(rig: Rig) -> _Zero:
+    reading, _ = rig.table_samples(0.4)
+    return _Zero(reading, rig.devices.clock.now_ns() - 200_000_000)
+
+
+def _contact_force(load: Array, angle: float) -> Array:
+    """(f_n, f_t) (..., 2) on the object from the table sensor's load (..., 6), turned by ``angle`` to the face."""
+    on_object = -se2.rotate(angle, TaskPlane().wrench_to_planar(load)[..., :2])
+    return np.stack([on_object[..., 1], on_object[..., 0]], axis=-1)
