@@ -10,8 +10,8 @@ import numpy as np
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import Arm, ForceTorqueSensor, TactileSensor, TagCamera
 from estimation.force_torque import FreeAirLoad, WristSensor, mean_wrench
-from estimation.state import StateEstimator
-from estimation.tactile_pose import TactilePoseEstimator, fuse
+from estimation.state import State, StateEstimator
+from estimation.tactile_pose import PoseStatus, TactilePoseEstimator, fuse
 from estimation.tag_pose import TagPose, estimate_planar_pose
 from mechanics import se2
 from mechanics.camera import CameraModel, TagGeometry
@@ -48,6 +48,8 @@ class Observer:
     fingers: tuple[Finger, ...] = ()
     state: StateEstimator | None = None
     tactile_frames: int = 1
+    #: the state behind the newest `estimate` from the fingers
+    felt: State | None = None
     _heard_ns: int = -1
 
     def see(self, bodies: tuple[str, ...]) -> dict[str, TagPose | None]:
@@ -103,6 +105,14 @@ class Observer:
             self._feel(self.state)
         extrinsic = self.see(("eo",))["eo"] if self.tags.get("eo") else None
         now = self.state.state()
+        if "tactile" not in now.ages:
+            raise DeviceFault(
+                ", ".join(finger.sensor.name for finger in self.fingers),
+                "feel the grasped object",
+                f"{now.status.value}: {now.reason}" if now.reason else now.status.value,
+                "See to the fingers and the grasp, or take the pose from tags: --set trial.go_pose=tags",
+            )
+        self.felt = now
         return PlanarState(now.ee, now.go, None if extrinsic is None else extrinsic.pose, now.wrench)
 
     def _feel(self, state: StateEstimator) -> None:
@@ -120,6 +130,11 @@ class Observer:
         prior = state.expected(at)
         found = fuse(prior, [f.method.estimate(image, prior) for f, image in zip(self.fingers, pictures, strict=True)])
         state.push_tactile(at, prior, found)
+
+    @property
+    def slip(self) -> str:
+        """What is known of the object slipping in the fingers in this grasp; empty where it has not."""
+        return self.felt.reason if self.felt is not None and self.felt.status is PoseStatus.SLIPPED else ""
 
     def zero(self, load: FreeAirLoad, X_W_go: Array) -> None:
         """Take the wrist sensor's offset in free air, with the go at ``X_W_go`` and only its weight on the sensor."""

@@ -71,6 +71,7 @@ class Trial:
         self._observer, self._clock, self._load = observer, clock, load
         self._settings, self._watch = settings, watch
         self._result = TrialResult("completed", "", plan)
+        self._slip_told = False
         self._mover = Mover(
             observer.arm, clock, settings.control_rate, observer.arm_pose(), settings.approach_speed, watch.tick
         )
@@ -153,10 +154,16 @@ class Trial:
         self._settle()
         for _ in range(s.corrections if controller.feedback else 0):
             controller.in_contact(plan.go[k], plan.wrench[k], self._observer.estimate())
+            self._tell_slip()
             mover.ramp(controller.command(plan.go[k], plan.ee[k]), s.ramp)
             self._settle()
         estimated = self._observer.estimate() if self._observer.fingers and controller.feedback else None
         return self._observer.measure(), mover.pose, estimated
+
+    def _tell_slip(self) -> None:
+        if self._observer.slip and not self._slip_told:
+            self._slip_told = True
+            self._watch.event("warning", self._observer.slip)
 
     def _converge_in_air(self, controller: Controller, go: Array, ee: Array) -> None:
         for _ in range(self._settings.air_corrections):

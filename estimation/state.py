@@ -35,8 +35,8 @@ class State:
     """What is known at ``capture_ns``. Poses (3,) in W; None where nothing is known.
 
     ``go_covariance`` (3, 3) is of a left perturbation of X_ee_go about ee's origin, in ee; ``wrench`` (3,) of the
-    sensor on the go about the grasp centre, axes of W, with its covariance; ``contact`` where the environment touches the go,
-    in the go's frame. ``ages`` [s] of each source at ``capture_ns``; ``status`` of the go's pose, with its ``reason``.
+    sensor on the go about the grasp centre, axes of W, with its covariance; ``contact`` where the environment touches
+    the go, in its frame. ``ages`` [s] of each source at ``capture_ns``; ``status`` of the go's pose and its ``reason``.
     """
 
     capture_ns: int
@@ -175,8 +175,11 @@ class StateEstimator:
     # -- out -----------------------------------------------------------------------------------------------------------
 
     def state(self, capture_ns: int | None = None) -> State:
-        """The state at an instant, by default that of the newest pose and wrench. Raises NoState."""
-        at = capture_ns if capture_ns is not None else min(self._newest())
+        """The state at an instant, by default the newest of which pose and wrench, or a tactile image, tell.
+
+        Raises NoState.
+        """
+        at = capture_ns if capture_ns is not None else max(min(self._newest()), self._seen.get("tactile", 0))
         x, ee, w = self._displacement(at)
         prior = self.grasp.predicted(at, x)
         go = se2.compose(ee, prior.pose)

@@ -7,7 +7,7 @@ from math import inf
 from drivers.config import ForceTorqueConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
-from experiments.calibrate.schema import FrictionStage
+from experiments.calibrate.schema import CameraStage, FrictionStage
 from experiments.calibrate.store import Calibrations, load
 from experiments.files import Resolved
 from experiments.schema import ExecuteStage, PlanStage
@@ -94,8 +94,8 @@ def _device_problems(resolved: Resolved) -> list[Problem]:
         problems.append(document.problem(("devices",), "the station has no force_torque on the wrist", "mount: wrist"))
     under = any(isinstance(d, ForceTorqueConfig) and d.mount == "table" for d in station.devices.values())
     for i, stage in enumerate(resolved.experiment.stages):
-        if isinstance(stage, FrictionStage) and not under:
-            wrong = "the station has no force_torque under the table, which measures the contact force"
+        if isinstance(stage, FrictionStage | CameraStage) and not under:
+            wrong = "the station has no force_torque under the table, which feels what touches it"
             problems.append(resolved.experiment_document.problem(("stages", i), wrong, "a device with mount: table"))
     if not station.table_tags:
         problems.append(document.problem(("table_tags",), "the table has no tags", "at least one tag"))

@@ -1,6 +1,6 @@
 """Stage `calibrate_elasticity`: the paper's protocol. The object is fixed to the table, the fingers move about it.
 
-The fixed object's pose comes from its tag, seen in every sample and averaged, since it does not move; the fingers'
+The fixed object's pose comes from its tag, seen often before the samples, since it does not move; the fingers'
 from the arm; the wrench from the wrist sensor (Tactile Elasticity Characterization).
 """
 

@@ -113,6 +113,14 @@ def test_images_find_a_grasp_that_is_off_and_it_stays_found_under_another_wrench
     assert np.hypot(*error[:2]) < 5e-5 and abs(error[2]) < 5e-4
 
 
+def test_a_picture_newer_than_every_other_reading_is_part_of_the_state() -> None:
+    made, held = estimator(), Held((0.0015, -0.001, 0.03))
+    feed(made, held, 200 * MS, EE, np.zeros(3))
+    look(made, held, 210 * MS, EE, np.zeros(3), GOOD)
+    error = se2.between(held.go(EE, np.zeros(3)), made.state().go)
+    assert np.hypot(*error[:2]) < 5e-5 and abs(error[2]) < 5e-4
+
+
 def test_what_images_leave_open_stays_at_the_prior_with_the_priors_variance() -> None:
     made, held = estimator(), Held((0.001, 0.002, 0.0))
     blind_in_y = GOOD * np.diag([1.0, 0.0, 1.0])

@@ -63,13 +63,13 @@ CASES = {
     "misspelt key": (
         ("mine.yaml", "sensor: soft", "sensr: soft"),
         "mine.yaml, line 3: sensr: unknown key",
-        "one of extrinsic_object, friction, grasp",
+        "one of calibration, extrinsic_object, friction, grasp",
         "sensor",
     ),
     "unknown key": (
         ("mine.yaml", "station: sim", "weather: fine"),
         "mine.yaml, line 2: weather: unknown key",
-        "one of extrinsic_object",
+        "one of calibration, extrinsic_object",
         None,
     ),
     "misspelt key of a stage": (
@@ -129,7 +129,7 @@ CASES = {
     "unknown stage": (
         ("mine.yaml", "stage: execute", "stage: exicute"),
         "mine.yaml, line 11: stages.1.stage: unknown value 'exicute'",
-        "one of execute, plan",
+        "calibrate_friction, execute, plan",
         "execute",
     ),
     "unknown sensor": (
