@@ -35,7 +35,7 @@ demo: setup  ## plan, execute and report grasped pivoting on the simulated stati
 	@$(BIN)/extrinsic run experiments/grasped_pivoting.yaml
 
 test: setup browser  ## the default test suite
-	@$(BIN)/python -m pytest -n 2 --dist loadscope
+	@$(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder tests/experiments tests  # the long ones first
 
 test-slow: setup browser  ## the long tests
 	@$(BIN)/python -m pytest -m slow --timeout=1800

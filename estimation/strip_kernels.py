@@ -80,6 +80,16 @@ def nearest_edges(points, lines, within, outside, corner, edges):
 
 
 @njit(cache=True)
+def _from_edge(x, y, line, own, window):
+    """How far a point is along its edge and beyond it [m], and whether both lie within the window."""
+    along = (x - line[0]) * line[2] + (y - line[1]) * line[3]
+    a = (x - line[0]) * line[3] - (y - line[1]) * line[2]
+    a -= own[0] + own[1] * (along - 0.5 * line[4])
+    inside = window[2] <= along <= line[4] - window[2] and -window[0] <= a <= window[1]
+    return along, a, inside
+
+
+@njit(cache=True)
 def kink_equations(
     points,
     rays,
@@ -124,12 +134,8 @@ def kink_equations(
         k = edges[i]
         x, y = points[i, 0], points[i, 1]
         tx, ty, length = lines[k, 2], lines[k, 3], lines[k, 4]
-        along = (x - lines[k, 0]) * tx + (y - lines[k, 1]) * ty
-        if along < window[2] or along > length - window[2]:
-            continue
-        a = (x - lines[k, 0]) * ty - (y - lines[k, 1]) * tx
-        a -= own[k, 0] + own[k, 1] * (along - 0.5 * length)
-        if a < -window[0] or a > window[1]:
+        along, a, inside = _from_edge(x, y, lines[k], own[k], window)
+        if not inside:
             continue
         strip = starts[k] + min(int(along / width), starts[k + 1] - starts[k] - 1)
         s, c = slopes[strip], own[k, 2]
@@ -200,13 +206,9 @@ def departure_costs(
     for i in range(points.shape[0]):
         k = edges[i]
         x, y = points[i, 0], points[i, 1]
-        tx, ty, length = lines[k, 2], lines[k, 3], lines[k, 4]
-        along = (x - lines[k, 0]) * tx + (y - lines[k, 1]) * ty
-        if along < window[2] or along > length - window[2]:
-            continue
-        a = (x - lines[k, 0]) * ty - (y - lines[k, 1]) * tx
-        a -= own[k, 0] + own[k, 1] * (along - 0.5 * length)
-        if a < -window[0] or a > window[1]:
+        tx, ty = lines[k, 2], lines[k, 3]
+        along, a, inside = _from_edge(x, y, lines[k], own[k], window)
+        if not inside:
             continue
         strip = starts[k] + min(int(along / width), starts[k + 1] - starts[k] - 1)
         if not active[strip]:

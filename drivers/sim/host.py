@@ -11,6 +11,7 @@ session closed, exit code 0.
 from __future__ import annotations
 
 import ctypes
+import gc
 import json
 import logging
 import os
@@ -329,6 +330,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             _die_with_parent()
 
         def ready(host: Host) -> None:
+            gc.collect()
+            gc.freeze()  # what is here now stays: looking through it again and again costs pauses in mid-step
             threading.Thread(target=_end_with_input, args=(host,), name="parent", daemon=True).start()
             tell(ready=os.getpid())
 

@@ -24,14 +24,15 @@ name: short
 grasped_object: tall_box
 extrinsic_object: hbox
 friction: {go-ground: 0.3, go-eo: 0.35, eo-ground: 0.4}
+trial: {approach_speed: 0.3}
 stages:
-  - {stage: calibrate_force_torque, orientations: 5, seconds: 0.1}
-  - {stage: calibrate_camera, views: 9, poses: 8}
+  - {stage: calibrate_force_torque, orientations: 4, seconds: 0.1}
+  - {stage: calibrate_camera, views: 9, poses: 6}
   - {stage: calibrate_clock, seconds: 3}
   - {stage: calibrate_elasticity, samples: 24, dwell: 0.4, long_dwell: 0.4}
-  - {stage: calibrate_friction, pair: go-ground, strokes: 4}
-  - {stage: calibrate_friction, pair: go-eo, strokes: 4}
-  - {stage: calibrate_friction, pair: eo-ground, strokes: 4}
+  - {stage: calibrate_friction, pair: go-ground, strokes: 2}
+  - {stage: calibrate_friction, pair: go-eo, strokes: 2}
+  - {stage: calibrate_friction, pair: eo-ground, strokes: 2}
 """
 
 
