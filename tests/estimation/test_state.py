@@ -66,7 +66,11 @@ def tactile(go_in_ee: Array, information: Array, prior_pose: Array, prior_covari
     precision = np.linalg.inv(prior_covariance) + information
     posterior = np.linalg.solve(precision, information @ delta)
     return TactilePose(
-        se2.compose(posterior, prior_pose), np.linalg.inv(precision), information, np.empty((0, 3)), PoseStatus.OK
+        se2.compose(posterior, prior_pose),
+        np.asarray(np.linalg.inv(precision), np.float64),
+        information,
+        np.empty((0, 3)),
+        PoseStatus.OK,
     )
 
 
