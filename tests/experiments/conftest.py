@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -9,6 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    # a shell has its background jobs ignore Ctrl-C, and the commands under test would inherit that
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def free_port() -> int:
