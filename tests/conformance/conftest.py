@@ -206,17 +206,3 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         cells = [_OUTCOMES.get((kind, backend)) for backend in BACKENDS]
         texts = ["-" if cell is None else f"{sum(cell)} of {len(cell)}" for cell in cells]
         terminalreporter.write_line(f"{kind:16}" + "".join(f"{text:>20}" for text in texts))
-
-
-@pytest.fixture(autouse=True)
-def mended(request):
-    """Leave every device as the next claim expects it."""
-    if "lab" not in request.fixturenames:
-        yield
-        return
-    lab = request.getfixturevalue("lab")
-    yield
-    lab.simulation.clear_faults()
-    for device in lab.devices.values():
-        device.close()
-        device.connect()

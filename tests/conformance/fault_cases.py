@@ -7,8 +7,10 @@ import time
 import numpy as np
 import pytest
 
+from drivers.config import WorldConfig
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmTarget
+from drivers.sim.world import World
 
 NAMES = {
     "arm": "arm",
@@ -60,3 +62,11 @@ def wait_until_gone(device, within=2.0):
         except DeviceFault:
             return
     raise AssertionError(f"{device.name} is still there after {within} s")
+
+
+def become(lab, scene, profile):
+    world = WorldConfig(profile=profile)
+    if isinstance(lab.simulation, World):
+        lab.simulation.reset(0, scene, world)
+    else:
+        lab.simulation.reset(0, scene, world.model_dump())

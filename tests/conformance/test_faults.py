@@ -5,11 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.config import (
-    WorldConfig,
-)
 from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, NotConnected, ProtocolError
-from drivers.sim.world import World
 from mechanics.readings import Status
 
 from .fault_cases import (
@@ -17,6 +13,7 @@ from .fault_cases import (
     NAMES,
     PICTURES,
     STREAMS,
+    become,
     befalls,
     content,
     inject,
@@ -25,6 +22,21 @@ from .fault_cases import (
     statuses,
     wait_until_gone,
 )
+
+
+@pytest.fixture(autouse=True)
+def mended(request):
+    """Leave every device as the next claim expects it."""
+    if "lab" not in request.fixturenames:
+        yield
+        return
+    lab = request.getfixturevalue("lab")
+    yield
+    lab.simulation.clear_faults()
+    for device in lab.devices.values():
+        device.close()
+        device.connect()
+
 
 # -- drop --------------------------------------------------------------------------------------------------------------
 
@@ -155,14 +167,6 @@ def test_a_stuck_value_is_stale_where_noise_would_move_it(lab, fault, kind, scen
     lab.clock.sleep(0.1)
     assert lab.devices["wrist_ft"].latest().stamp.status is Status.OK
     become(lab, scene, "ideal")
-
-
-def become(lab, scene, profile):
-    world = WorldConfig(profile=profile)
-    if isinstance(lab.simulation, World):
-        lab.simulation.reset(0, scene, world)
-    else:
-        lab.simulation.reset(0, scene, world.model_dump())
 
 
 @befalls("stuck", *PICTURES)
