@@ -4,7 +4,8 @@ Forces of a contact that slips lie on the cone's edges, |f_t| = µ f_n; those of
 likelihood of a sample is a mixture of three: an atom on the edge, as wide as the force's noise; a uniform share of the
 cone, blurred by the same noise; and a few outliers anywhere. The edge of the mixture is the coefficient, whatever the
 share that slips, which neither the largest ratio nor a quantile can say. The cone's apex is a nuisance with a prior: a
-zero that is off by 0.1 N is 10 % of the ratio at 1 N.
+zero that is off by 0.1 N is 10 % of the ratio at 1 N. Where forces come in strokes, each after a tare of its own, every
+stroke has an offset of its own too, which is integrated out: some readings of one stroke are no independent evidence.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 from scipy.spatial import ConvexHull, QhullError
-from scipy.special import expit, ndtr
+from scipy.special import expit, logsumexp, ndtr
 from scipy.stats import norm
 
 from estimation.errors import FitError, finite_rows
@@ -27,6 +28,10 @@ LEAST_NORMAL_FORCE = 1.0
 FORCE_NOISE = 0.02
 #: how far a tared zero may be off, 1 sigma [N]
 ZERO_ERROR = 0.1
+#: how far it may be off from stroke to stroke, 1 sigma, and by which factor that itself is not known, 1 sigma
+STROKE_ERROR, STROKE_FACTOR = 0.02, 2.0
+#: offsets of a stroke that its likelihood is summed over, in sigmas
+_OFFSETS = np.linspace(-3.5, 3.5, 43)
 #: calibration error of each force axis, relative, 1 sigma: it scales the ratio and no sample shows it
 GAIN_ERROR = 0.005
 #: samples that must slip, and by how much slip must raise the log likelihood
@@ -72,18 +77,21 @@ def fit_friction(
     slip_speed_noise: float = 0.002,
     zero_error: float = ZERO_ERROR,
     gain_error: float = GAIN_ERROR,
+    strokes: ArrayLike | None = None,
 ) -> FrictionFit:
     """The coefficient from ``force`` (n, 2) = (f_n, f_t) [N] of one contact in random motion.
 
     ``force_noise`` is 1 sigma of one component. Samples should be at least as far apart as the noise is correlated.
     ``slip_speed`` (n,) [m/s], where known, parts the samples at three times its noise, and each part gets shares of its
     own. ``zero_error`` [N] and ``gain_error`` (relative) are 1 sigma of what a tare and the sensor's calibration leave.
+    ``strokes`` (n,) numbers the stroke of each sample; each has a tare, and so an offset, of its own.
     Raises FitError for NaN, too few samples, no normal or no tangential force, or when no slip is seen.
     """
     values = finite_rows("contact forces", force, (2,), ("f_n", "f_t"))
     if force_noise <= 0:
         raise FitError("force_noise", "a positive number [N]", f"{force_noise:g}", "Take the sensor's noise.")
     fast = _fast(slip_speed, slip_speed_noise, len(values))
+    stroke = _numbered(strokes, len(values))
     pressed = values[:, 0] > LEAST_NORMAL_FORCE
     if not pressed.any():
         raise FitError(
@@ -100,7 +108,7 @@ def fit_friction(
             f"{int(pressed.sum())} of {len(values)}",
             "Record longer, or press harder.",
         )
-    values, fast = values[pressed], fast[pressed]
+    values, fast, stroke = values[pressed], fast[pressed], stroke[pressed]
     if np.percentile(np.abs(values[:, 1]), 95) < 3 * max(force_noise, zero_error / 3):
         raise FitError(
             "contact forces",
@@ -108,7 +116,13 @@ def fit_friction(
             f"95 % below {np.percentile(np.abs(values[:, 1]), 95):.2g} N: the tangential axis is not excited",
             "Drag the object along the surface, do not only press it.",
         )
-    return _Cone(values, fast, force_noise, zero_error).fit(gain_error)
+    plain = _Cone(values, fast, force_noise, zero_error)
+    found = plain.best(plain.starts())
+    plain.check_slip(found)
+    if strokes is None:
+        return plain.result(found, gain_error)
+    by_stroke = _StrokeCone(values, fast, stroke, force_noise, zero_error)
+    return by_stroke.result(by_stroke.best([by_stroke.start(found)]), gain_error)
 
 
 def _fast(slip_speed: ArrayLike | None, noise: float, n: int) -> NDArray[np.bool_]:
@@ -122,6 +136,15 @@ def _fast(slip_speed: ArrayLike | None, noise: float, n: int) -> NDArray[np.bool
     return np.abs(speed) > 3 * noise
 
 
+def _numbered(strokes: ArrayLike | None, n: int) -> NDArray[np.intp]:
+    if strokes is None:
+        return np.zeros(n, np.intp)
+    numbers = np.asarray(strokes)
+    if numbers.shape != (n,):
+        raise FitError("strokes", f"one number for each of {n} forces", f"shape {numbers.shape}", "Number each force.")
+    return np.unique(numbers, return_inverse=True)[1]
+
+
 class _Cone:
     """The mixture's likelihood of f_t given f_n, for checked samples.
 
@@ -129,17 +152,21 @@ class _Cone:
     of samples the logits of its shares that slip and that are outliers.
     """
 
+    #: parameters before the shares
+    ahead = _PARAMETERS
+
     def __init__(self, force: Array, fast: NDArray[np.bool_], noise: float, zero_error: float):
         self._force, self._noise, self._zero = force, noise, zero_error
         self._groups = [group for group in (~fast, fast) if group.any()]
         self._span = float(np.abs(force[:, 1]).max()) * 1.05
-        self._unit = np.array([0.01, 0.3 * zero_error, 0.3 * zero_error, 0.2, *[0.5] * (2 * len(self._groups))])
+        first = [0.01, 0.3 * zero_error, 0.3 * zero_error, *[0.2] * (self.ahead - 3)]
+        self._unit = np.array([*first, *[0.5] * (2 * len(self._groups))])
 
-    def _densities(self, p: Array) -> Array:
-        """Densities (n, 3) [1/N] of |f_t| from the apex: slipping, sticking, neither."""
+    def _densities(self, p: Array, offset: Array | float = 0.0) -> Array:
+        """Densities (..., n, 3) [1/N] of |f_t| from the apex: slipping, sticking, neither; ``offset`` (..., n) [N]."""
         mu, width = p[0], np.exp(p[3]) * self._noise * np.sqrt(1 + p[0] ** 2)
         edge = mu * np.maximum(self._force[:, 0] - p[1], 0.25 * LEAST_NORMAL_FORCE)
-        side = np.abs(self._force[:, 1] - p[2])
+        side = np.abs(self._force[:, 1] - p[2]) - offset
         beyond = (side - edge) / width
         atom = np.exp(-0.5 * beyond**2) / (width * np.sqrt(2 * np.pi))
         within = (ndtr(-beyond) - ndtr(-(side + edge) / width)) / edge
@@ -149,19 +176,25 @@ class _Cone:
         """Shares (n, 3) of the three, by the group of each sample."""
         shares = np.empty((len(self._force), 3))
         for k, group in enumerate(self._groups):
-            slip, out = expit(p[_PARAMETERS + 2 * k : _PARAMETERS + 2 * k + 2])
+            slip, out = expit(p[self.ahead + 2 * k : self.ahead + 2 * k + 2])
             out *= MOST_OUTLIERS
             shares[group] = (1 - out) * slip, (1 - out) * (1 - slip), out
         return shares
 
+    def _joint(self, p: Array) -> Array:
+        """Densities times shares (n, 3)."""
+        return self._densities(p) * self._shares(p)
+
+    def _log_likelihood(self, p: Array) -> float:
+        return float(np.log(np.maximum(self._joint(p).sum(axis=1), 1e-300)).sum())
+
     def _cost(self, z: Array) -> float:
         p = z * self._unit
-        if p[0] <= 1e-4 or abs(p[3]) > 5:
+        if p[0] <= 1e-4 or np.abs(p[3 : self.ahead]).max() > 5:
             return 1e9
-        joint = self._densities(p) * self._shares(p)
         # weak priors keep a share or a width that the samples do not show from running away
-        prior = float(np.sum((p[1:3] / self._zero) ** 2) + p[3] ** 2 + np.sum((p[_PARAMETERS:] / 3) ** 2))
-        return 0.5 * prior - self._sides(p) - float(np.log(np.maximum(joint.sum(axis=1), 1e-300)).sum())
+        prior = float(np.sum((p[1:3] / self._zero) ** 2) + p[3] ** 2 + np.sum((p[self.ahead :] / 3) ** 2))
+        return 0.5 * prior - self._sides(p) - self._log_likelihood(p)
 
     def _sides(self, p: Array) -> float:
         """Log likelihood of the sides on which the samples lie, each side with its own share.
@@ -172,7 +205,7 @@ class _Cone:
         counts = np.array([up, len(self._force) - up])
         return float(np.sum(counts * np.log(np.maximum(counts, 1e-9) / len(self._force))))
 
-    def _starts(self) -> list[Array]:
+    def starts(self) -> list[Array]:
         """The three best of a grid of coefficients and widths, with the apex at zero, a tenth of a unit apart."""
         ratios = np.abs(self._force[:, 1]) / self._force[:, 0]
         grid = np.unique(np.quantile(ratios, np.linspace(0.2, 1.0, 80)))
@@ -180,15 +213,16 @@ class _Cone:
         trials = [np.array([mu, 0, 0, wide, *shares]) / self._unit for mu in grid[grid > 1e-3] for wide in (0.0, 1.2)]
         return sorted(trials, key=self._cost)[:3]
 
-    def fit(self, gain_error: float) -> FrictionFit:
-        """The maximum, checked for slip, with an interval from the curvature there."""
-        found = [minimize(self._cost, z, method="L-BFGS-B", options={"maxiter": 200}) for z in self._starts()]
-        best = min(found, key=lambda one: one.fun)
-        z, p = best.x, best.x * self._unit
+    def best(self, starts: list[Array]) -> Array:
+        """The parameters with the highest likelihood that the ``starts`` lead to."""
+        found = [minimize(self._cost, z, method="L-BFGS-B", options={"maxiter": 200}) for z in starts]
+        return min(found, key=lambda one: one.fun).x
+
+    def result(self, z: Array, gain_error: float) -> FrictionFit:
+        """The fit at the maximum ``z``, with an interval from the curvature there."""
+        p = z * self._unit
         mu = float(p[0])
-        joint = self._densities(p) * self._shares(p)
-        of = joint / np.maximum(joint.sum(axis=1, keepdims=True), 1e-300)
-        self._check_slip(p, float(best.fun), of)
+        of = self._responsibilities(p)
         covariance = np.linalg.pinv(_hessian(self._cost, z, np.full(len(z), 0.05)), hermitian=True)
         variance = covariance[0, 0] * self._unit[0] ** 2 + 2 * (gain_error * mu) ** 2
         half = float(norm.ppf(0.975)) * float(np.sqrt(max(variance, 0.0)))
@@ -206,13 +240,21 @@ class _Cone:
             sides=sides,
         )
 
-    def _check_slip(self, p: Array, cost: float, of: Array) -> None:
+    def _responsibilities(self, p: Array) -> Array:
+        """How likely each sample (n, 3) slips, sticks, or does neither."""
+        joint = self._joint(p)
+        return joint / np.maximum(joint.sum(axis=1, keepdims=True), 1e-300)
+
+    def check_slip(self, z: Array) -> None:
+        """Raise FitError unless the maximum ``z`` shows slip, which explains the samples better than none."""
+        p, cost = z * self._unit, self._cost(z)
+        of = self._responsibilities(p)
         slipping = float(of[:, 0].sum())
         # the best that sticking and outliers alone can do
         stuck = p.copy()
-        stuck[_PARAMETERS::2] = -20.0
+        stuck[self.ahead :: 2] = -20.0
         fixed = np.zeros(len(p), bool)
-        fixed[_PARAMETERS::2] = True
+        fixed[self.ahead :: 2] = True
         unused = 0.5 * float(np.sum((stuck[fixed] / 3) ** 2))
 
         def alone(free: Array) -> float:
@@ -234,6 +276,40 @@ class _Cone:
             f"{slipping:.0f} of {len(of)} that could: no slip seen along the tangential axis, µ is at least {p[0]:.3g}",
             "Drag further or faster, or press less, until the contact slides.",
         )
+
+
+class _StrokeCone(_Cone):
+    """The same, with an offset for every stroke that is integrated out; the fifth parameter is the log of its size."""
+
+    ahead = _PARAMETERS + 1
+
+    def __init__(
+        self, force: Array, fast: NDArray[np.bool_], stroke: NDArray[np.intp], noise: float, zero_error: float
+    ):
+        order = np.argsort(stroke, kind="stable")
+        super().__init__(force[order], fast[order], noise, zero_error)
+        self._stroke = stroke[order]
+        self._begins = np.flatnonzero(np.diff(self._stroke, prepend=-1))
+        self._weights = norm.logpdf(_OFFSETS) - logsumexp(norm.logpdf(_OFFSETS))
+
+    def start(self, plain: Array) -> Array:
+        """From where the fit without offsets ends."""
+        return np.insert(plain, _PARAMETERS, 0.0)
+
+    def _by_offset(self, p: Array) -> Array:
+        """Log likelihood (offsets, strokes) of each stroke with each offset, that of the offset included."""
+        offsets = STROKE_ERROR * np.exp(p[_PARAMETERS]) * _OFFSETS
+        joint = np.einsum("osc,sc->os", self._densities(p, offsets[:, None]), self._shares(p))
+        return np.add.reduceat(np.log(np.maximum(joint, 1e-300)), self._begins, axis=1) + self._weights[:, None]
+
+    def _log_likelihood(self, p: Array) -> float:
+        prior = -0.5 * (p[_PARAMETERS] / np.log(STROKE_FACTOR)) ** 2
+        marginal: Array = np.asarray(logsumexp(self._by_offset(p), axis=0), float)
+        return float(marginal.sum() + prior)
+
+    def _joint(self, p: Array) -> Array:
+        likeliest = STROKE_ERROR * np.exp(p[_PARAMETERS]) * _OFFSETS[self._by_offset(p).argmax(axis=0)]
+        return self._densities(p, likeliest[self._stroke]) * self._shares(p)
 
 
 def _hessian(cost, p: Array, steps: Array) -> Array:

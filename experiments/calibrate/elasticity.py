@@ -102,12 +102,19 @@ def _rows(matrix: Array) -> Matrix3:
     return vector3(matrix[0]), vector3(matrix[1]), vector3(matrix[2])
 
 
+def amplitudes(stage: ElasticityStage, stiffness: Array) -> Array:
+    """The largest displacements (3,) [m, m, rad] of the stage's holds, by the (3, 3) ``stiffness`` that is believed."""
+    usual, most = (stage.force, stage.force, stage.torque), (stage.most_force, stage.most_force, stage.most_torque)
+    least = np.array([stage.least_mm * 1e-3, stage.least_mm * 1e-3, np.radians(stage.least_deg)])
+    return np.maximum(usual / np.diag(stiffness), np.minimum(least, most / np.diag(stiffness)))
+
+
 def schedule(stage: ElasticityStage, stiffness: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Displacements (n, 3) [m, m, rad] of the holds in their order, and the via point (n, 3) before each.
 
     The via points take every side, so that what the membrane remembers does not go with where it is.
     """
-    scale = np.array([stage.force, stage.force, stage.torque]) / np.diag(stiffness)
+    scale = amplitudes(stage, stiffness)
     along = np.zeros((stage.samples // 3, 3))
     along[np.arange(len(along)), np.arange(len(along)) % 3] = rng.uniform(-1, 1, len(along))
     holds = rng.permutation(np.concatenate([along, rng.uniform(-1, 1, (stage.samples - len(along), 3))])) * scale

@@ -1,7 +1,8 @@
 """Stage `calibrate_friction`: random strokes in contact, and the cone that their forces fill (the paper's protocol).
 
-Every pair is measured by the sensor under the table. For `go-eo` the extrinsic object is fixed to the table; for
-`eo-ground` it is taken into the fingers instead of the grasped one, and dragged.
+Every pair is measured by the sensor under the table, and by the one at the wrist where its tool has been weighed. For
+`go-eo` the extrinsic object is fixed to the table; for `eo-ground` it is taken into the fingers instead of the grasped
+one, and dragged.
 """
 
 from __future__ import annotations
@@ -10,14 +11,14 @@ import numpy as np
 
 from drivers.scene import Scene
 from estimation.errors import FitError
-from estimation.friction_fit import fit_friction
+from estimation.friction_fit import GAIN_ERROR, fit_friction
 from experiments import setup
 from experiments.calibrate import store
 from experiments.calibrate.models import FrictionCalibration
 from experiments.calibrate.rig import Rig, at_hand
 from experiments.calibrate.samples import save_samples
 from experiments.calibrate.schema import FrictionStage
-from experiments.calibrate.strokes import Dragged, drawn, stroked
+from experiments.calibrate.strokes import Dragged, drawn, stroked, witnesses
 from experiments.calibrate.threads import one_thread
 from experiments.context import RunContext
 from mechanics.catalogue import ObjectModel
@@ -27,6 +28,8 @@ from mechanics.readings import Array
 TABLE_HALF = 0.1
 #: a face steeper than this [rad] is not stood on from above
 STEEPEST = np.radians(50.0)
+#: what is left of a sensor's zero that is taken before and after each stroke, 1 sigma [N]
+TARED = 0.02
 #: free space between the objects while they are put into place [m]
 ROOM = 0.03
 
@@ -47,13 +50,18 @@ def friction_stage(context: RunContext, stage: FrictionStage) -> None:
                 advance()
         _restored(rig, stage)
         rig.home()
+        sensors = tuple(witness.sensor.name for witness in witnesses(rig))
     samples = np.concatenate(forces)
     with one_thread():
-        fit = fit_friction(samples)
+        fit = fit_friction(
+            samples,
+            zero_error=TARED,
+            gain_error=GAIN_ERROR / np.sqrt(len(sensors)),
+            strokes=np.repeat(np.arange(len(forces)), [len(one) for one in forces]),
+        )
     roles = tuple(body for body in stage.pair.split("-") if body != "ground")
-    table = rig.devices.force_torque("table").name
     found = FrictionCalibration(
-        origin=store.origin(resolved, (table,), roles, context.folder.path.name),
+        origin=store.origin(resolved, sensors, roles, context.folder.path.name),
         pair=stage.pair,
         mu=fit.mu,
         interval=fit.interval,

@@ -119,25 +119,33 @@ class Rig:
         The covariance comes from the means of twenty pieces, so that slow noise counts as well.
         """
         wrist = self.devices.force_torque("wrist")
-        return self._averaged(wrist, seconds, "the wrist sensor")
+        return self._averaged(wrist, seconds)
 
     def table_samples(self, seconds: float) -> tuple[Array, Array]:
         """As `wrist_samples`, of the sensor under the table."""
-        return self._averaged(self.devices.force_torque("table"), seconds, "the sensor under the table")
+        return self._averaged(self.devices.force_torque("table"), seconds)
 
-    def _averaged(self, sensor: ForceTorqueSensor, seconds: float, what: str) -> tuple[Array, Array]:
+    def mean_since(self, sensor: ForceTorqueSensor, begin: int) -> Array:
+        """Mean (6,) of a sensor's readings since ``begin`` [ns]."""
+        return self._since(sensor, begin).mean(axis=0)
+
+    def _averaged(self, sensor: ForceTorqueSensor, seconds: float) -> tuple[Array, Array]:
         begin = self.devices.clock.now_ns()
         self.rest(seconds)
+        values = self._since(sensor, begin)
+        pieces = np.array([piece.mean(axis=0) for piece in np.array_split(values, 20)])
+        return values.mean(axis=0), np.cov(pieces.T) / len(pieces)
+
+    def _since(self, sensor: ForceTorqueSensor, begin: int) -> Array:
         values = np.array([r.wrench for r in sensor.since(begin) if r.stamp.status is Status.OK])
         if len(values) < 20:
             raise CommandRefused(
                 sensor.name,
-                f"average {what} for {seconds:g} s",
-                f"{len(values)} readings that can be trusted",
+                "average its readings",
+                f"{len(values)} that can be trusted in {(self.devices.clock.now_ns() - begin) * 1e-9:.2g} s",
                 "Average for longer, or see to the sensor",
             )
-        pieces = np.array([piece.mean(axis=0) for piece in np.array_split(values, 20)])
-        return values.mean(axis=0), np.cov(pieces.T) / len(pieces)
+        return values
 
 
 @contextmanager

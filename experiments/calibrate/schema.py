@@ -46,14 +46,20 @@ class ElasticityStage(_Model):
     """Identify K: the object is fixed to the table, the fingers are moved about it (the paper's protocol).
 
     A third of the samples lie along the axes, the rest at random within the amplitudes, in mixed order: amplitudes are
-    what makes ``force`` and ``torque`` by the stiffness that is believed beforehand. Each sample comes from another
-    side (a via point), and the wrench is read twice in a hold: what differs is creep.
+    what makes ``force`` and ``torque`` by the stiffness that is believed beforehand. Fingers so stiff that the arm's
+    own error would drown that are moved by ``least_mm`` and ``least_deg``, or as far as ``most_force`` and
+    ``most_torque`` allow. Each sample comes from another side (a via point), and the wrench is read twice in a hold:
+    what differs is creep.
     """
 
     stage: Literal["calibrate_elasticity"]
     samples: int = Field(default=200, ge=1, le=10_000)
     force: float = Field(default=6.0, gt=0, le=50, description="at the largest displacement along x and y [N]")
     torque: float = Field(default=0.2, gt=0, le=5, description="at the largest turn [N·m]")
+    least_mm: float = Field(default=1.5, ge=0, le=20, description="stiff fingers are moved so far, if `most` allows")
+    least_deg: float = Field(default=2.0, ge=0, le=20, description="and turned so far")
+    most_force: float = Field(default=20.0, gt=0, le=100, description="for that [N]")
+    most_torque: float = Field(default=1.5, gt=0, le=10, description="for that [N·m]")
     ramp: float = Field(default=0.25, gt=0, le=10, description="time for each of a sample's two motions [s]")
     dwell: float = Field(default=1.5, ge=0.4, le=60, description="length of a hold [s]")
     long_dwell: float = Field(default=15.0, ge=0.4, le=600, description="of every twentieth hold, for slow creep [s]")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
 
 from drivers.errors import CommandRefused
+from drivers.interfaces import ForceTorqueSensor
 from experiments.calibrate.rig import Rig
 from mechanics import se2
 from mechanics.contact import gravity_wrench
@@ -21,6 +23,8 @@ CLEARANCE = 0.008
 BIN = 0.02
 #: a force below this is no contact [N]
 TOUCHED = 0.5
+#: share of a stroke in which it gets up to its speed, and of it that it takes to stop
+GETTING_UP = 0.2
 #: how often the normal force is corrected before a stroke, and the largest step of it [m]
 CORRECTIONS, STEP = 3, 0.001
 
@@ -88,11 +92,11 @@ def drawn(
 
 
 def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Array:
-    """Contact forces (n, 2) = (f_n, f_t) [N] on the dragged object during one stroke, in the face's axes.
+    """Contact forces (n, 2) = (f_n, f_t) [N] on the object while it moves evenly in a stroke, in the face's axes.
 
-    From the sensor under the table: t is the normal turned by −90°. Its zero is taken before touch-down and after the
-    stroke, and drifts evenly in between. Before the stroke the normal force is brought to what is asked, since nobody
-    knows the grasp to the last tenth.
+    t is the normal turned by −90°. The mean of what `witnesses` say; each one's zero is taken before touch-down and
+    after the stroke, and drifts evenly in between. Before the stroke the normal force is brought to what is asked,
+    since nobody knows the grasp to the last tenth.
     """
     length = abs(stroke.end - stroke.begin)
     along = np.linspace(stroke.begin, stroke.end, max(2, int(length / 0.001)))
@@ -100,55 +104,131 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Array:
     loading = dragged.poses(stroke.tilt, np.full(10, along[0]), np.linspace(0.0, stroke.force, 10))
     normal = se2.rotate(dragged.X_W_face[2], np.array([0.0, 1.0]))
     up = np.array([*(CLEARANCE * normal), 0.0])
-    mover, table = rig.mover, rig.devices.force_torque("table")
+    mover, seen_by = rig.mover, witnesses(rig)
     above = loading[0] + up
     rig.lift_to(above[1] + 0.01)
     mover.travel(np.array([above[0], mover.pose[1], above[2]]))
     mover.travel(above)
     rig.rest(0.3)
-    before = _zero(rig)
+    before = _Rest.taken(rig, seen_by, 0.4)
     mover.ramp(loading[0], 0.5)
     mover.through(loading, 0.5)
-    angle = table.describe().extra["pose"][2] - dragged.X_W_face[2]
     deeper = np.zeros(3)
     softness = float(normal @ np.linalg.inv(dragged.stiffness[:2, :2]) @ normal)
     for _ in range(CORRECTIONS):
-        missing = stroke.force - _contact_force(rig.table_samples(0.1)[0] - before.reading, angle)[0]
-        deeper[:2] -= np.clip(missing * softness, -STEP, STEP) * normal
+        pushed = np.mean(_Rest.taken(rig, seen_by, 0.1).forces - before.forces, axis=0)
+        deeper[:2] -= np.clip((stroke.force - normal @ pushed) * softness, -STEP, STEP) * normal
         mover.ramp(loading[-1] + deeper, 0.2)
-    begin = rig.devices.clock.now_ns()
-    mover.through(pressed + deeper, length / speed)
-    readings = [r for r in table.since(begin) if r.stamp.status is Status.OK]
+    begin, end = _dragged(rig, pressed + deeper, length / speed)
+    moving = [witness.between(begin, end) for witness in seen_by]
     mover.ramp(pressed[-1] + up, 0.5)
     rig.rest(0.3)
-    after = _zero(rig)
-    if not readings:
-        raise CommandRefused(
-            table.name, "measure the contact force", "no reading that can be trusted", "See to the sensor"
-        )
-    times = np.array([r.stamp.capture_ns for r in readings])
-    share = ((times - before.at_ns) / (after.at_ns - before.at_ns))[:, None]
-    zeros = before.reading + share * (after.reading - before.reading)
-    forces = _contact_force(np.array([r.wrench for r in readings]) - zeros, angle)
-    bins = ((times - times[0]) * 1e-9 / BIN).astype(int)
-    means = np.array([forces[bins == b].mean(axis=0) for b in np.unique(bins)])
-    return means[means[:, 0] > TOUCHED]
+    after = _Rest.taken(rig, seen_by, 0.4)
+    share = (begin + (np.arange(len(moving[0])) + 0.5) * BIN * 1e9 - before.at_ns) / (after.at_ns - before.at_ns)
+    on_object = np.mean(
+        [
+            force - zero - share[:, None] * (later - zero)
+            for force, zero, later in zip(moving, before.forces, after.forces, strict=True)
+        ],
+        axis=0,
+    )
+    tangent = np.array([normal[1], -normal[0]])
+    forces = np.column_stack([on_object @ normal, on_object @ tangent])
+    return forces[forces[:, 0] > TOUCHED]
+
+
+def _dragged(rig: Rig, path: Array, seconds: float) -> tuple[int, int]:
+    """Move along ``path`` (M, 3), evenly but for the `GETTING_UP` at both ends; returns when it was even [ns].
+
+    A wrist sensor feels what it takes to speed up the tool as well, and that is no friction.
+    """
+    mover, a = rig.mover, GETTING_UP
+    ticks = max(10, round(seconds * rig.context.settings.control_rate))
+    u = np.arange(1, ticks + 1) / ticks
+    speed = np.minimum(1.0, np.minimum(u, 1 - u) / a) / (1 - a)
+    share = np.where(u < a, u**2 / (2 * a), np.where(u > 1 - a, 1 - a - (1 - u) ** 2 / (2 * a), u - a / 2)) / (1 - a)
+    points = np.column_stack([np.interp(share, np.linspace(0, 1, len(path)), column) for column in path.T])
+    slopes = np.column_stack(
+        [np.interp(share, np.linspace(0, 1, len(path)), np.gradient(column, 1 / (len(path) - 1))) for column in path.T]
+    )
+    begin = end = rig.devices.clock.now_ns()
+    for at, point, slope in zip(u, points, slopes * speed[:, None] / seconds, strict=True):
+        mover.follow(point, slope)
+        if at <= a:
+            begin = rig.devices.clock.now_ns()
+        if at <= 1 - a:
+            end = rig.devices.clock.now_ns()
+    return begin, end
+
+
+class Witness(ABC):
+    """A sensor that tells the contact force on the held object, up to a zero that drifts."""
+
+    def __init__(self, rig: Rig, sensor: ForceTorqueSensor):
+        self.rig, self.sensor = rig, sensor
+
+    @abstractmethod
+    def force(self, reading: Array, X_W_ee: Array) -> Array:
+        """Force (2,) [N] on the object, axes of W, by a reading (6,) with the end-effector at ``X_W_ee`` (3,)."""
+
+    def between(self, begin: int, end: int) -> Array:
+        """Forces (n, 2), each of a `BIN` from ``begin`` to ``end`` [ns]; NaN where a bin has no reading."""
+        readings = [r for r in self.sensor.since(begin) if r.stamp.status is Status.OK and r.stamp.capture_ns <= end]
+        poses = [p for p in self.rig.devices.arm.since(begin) if p.stamp.status is Status.OK]
+        if not readings or not poses:
+            silent = self.sensor.name if not readings else self.rig.devices.arm.name
+            raise CommandRefused(silent, "measure the contact force", "no reading that can be trusted", "See to it")
+        times = np.array([p.stamp.capture_ns for p in poses])
+        path = np.array([p.pose for p in poses])
+        bins = np.array([(r.stamp.capture_ns - begin) * 1e-9 / BIN for r in readings]).astype(int)
+        values = np.array([r.wrench for r in readings])
+        forces = np.full((int((end - begin) * 1e-9 / BIN), 2), np.nan)
+        for b in range(len(forces)):
+            at = begin + (b + 0.5) * BIN * 1e9
+            ee = np.array([np.interp(at, times, path[:, k]) for k in range(3)])
+            if (bins == b).any():
+                forces[b] = self.force(values[bins == b].mean(axis=0), ee)
+        return forces
+
+
+class _Table(Witness):
+    """The sensor under the table carries what the object presses on it, as long as nothing is added or taken away."""
+
+    def force(self, reading: Array, X_W_ee: Array) -> Array:
+        angle = self.sensor.describe().extra["pose"][2]
+        return -se2.rotate(angle, TaskPlane().wrench_to_planar(reading)[:2])
+
+
+class _Wrist(Witness):
+    """The fingers push the object down, which the contact pushes up; they also carry its weight, which is constant."""
+
+    def force(self, reading: Array, X_W_ee: Array) -> Array:
+        return -self.rig.observer.wrist_sensor.wrench_on_go(reading, X_W_ee, X_W_ee[:2])[:2]
+
+
+def witnesses(rig: Rig) -> list[Witness]:
+    """Who tells the contact force: the sensor under the table, and the wrist's where the tool on it has been weighed.
+
+    Each sensor's gain is off on its own, and no sample shows it; two halve the variance.
+    """
+    found: list[Witness] = [_Table(rig, rig.devices.force_torque("table"))]
+    if rig.context.believed.tool is not None:
+        found.append(_Wrist(rig, rig.devices.force_torque("wrist")))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
-class _Zero:
-    """What the sensor under the table reads (6,) without contact, at an instant."""
+class _Rest:
+    """What every witness says (w, 2) [N] while the arm rests, and the middle of that time."""
 
-    reading: Array
+    forces: Array
     at_ns: int
 
-
-def _zero(rig: Rig) -> _Zero:
-    reading, _ = rig.table_samples(0.4)
-    return _Zero(reading, rig.devices.clock.now_ns() - 200_000_000)
-
-
-def _contact_force(load: Array, angle: float) -> Array:
-    """(f_n, f_t) (..., 2) on the object from the table sensor's load (..., 6), turned by ``angle`` to the face."""
-    on_object = -se2.rotate(angle, TaskPlane().wrench_to_planar(load)[..., :2])
-    return np.stack([on_object[..., 1], on_object[..., 0]], axis=-1)
+    @classmethod
+    def taken(cls, rig: Rig, seen_by: list[Witness], seconds: float) -> _Rest:
+        """Rest for ``seconds`` and look."""
+        begin = rig.devices.clock.now_ns()
+        rig.rest(seconds)
+        ee = rig.observer.arm_pose()
+        forces = [witness.force(rig.mean_since(witness.sensor, begin), ee) for witness in seen_by]
+        return cls(np.array(forces), begin + round(seconds * 0.5e9))

@@ -120,3 +120,32 @@ def test_only_forces_of_motion_count_as_sliding():
     moving = sliding_forces(np.column_stack([t, t]), t, np.column_stack([x, 0 * x]), t)
     assert moving[:, 0].min() == pytest.approx(1.0, abs=0.03)
     assert len(moving) == pytest.approx(97, abs=3)
+
+
+def strokes_with_offsets(seed, count=16, n=24, offset=0.03):
+    """Forces of strokes that slip, each with a zero of its own that is off, and the stroke of each force."""
+    rng = np.random.default_rng(seed)
+    forces, number = [], np.repeat(np.arange(count), n)
+    for k in range(count):
+        normal = rng.uniform(2.0, 6.0) + 0.3 * rng.uniform(-1, 1, n)
+        tangential = (1 if k % 2 else -1) * MU * normal
+        noise = 0.01 * rng.standard_normal((n, 2)) + offset * rng.standard_normal(2)
+        forces.append(np.column_stack([normal, tangential]) + noise)
+    return np.concatenate(forces), number
+
+
+def test_readings_of_one_stroke_are_no_independent_evidence():
+    """χ² of ten draws: within what one degree of freedom each allows with the strokes told, far beyond without."""
+    told, untold = [], []
+    for seed in range(10):
+        forces, strokes = strokes_with_offsets(seed)
+        for errors, numbers in ((told, strokes), (untold, None)):
+            fit = fit_friction(forces, zero_error=0.01, gain_error=0.0, strokes=numbers)
+            errors.append((fit.mu - MU) / fit.standard_error)
+    assert np.sum(np.square(told)) < 23.2  # 99 % of χ² with 10 degrees of freedom
+    assert np.sum(np.square(untold)) > 2 * 23.2
+
+
+def test_strokes_that_do_not_number_the_forces_are_refused():
+    with pytest.raises(FitError, match="one number for each of 800 forces"):
+        fit_friction(cone(0), strokes=[0, 1])

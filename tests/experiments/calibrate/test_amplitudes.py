@@ -1,0 +1,38 @@
+"""How far the fingers are moved to find their stiffness: by a force, unless the arm's own error would drown that."""
+
+import numpy as np
+import pytest
+
+from experiments.calibrate.elasticity import amplitudes
+from experiments.calibrate.schema import ElasticityStage
+from mechanics.catalogue import load_sensor
+
+
+def test_soft_fingers_are_moved_by_the_force_that_is_asked():
+    stage = ElasticityStage(stage="calibrate_elasticity", force=6.0, torque=0.2)
+    x, y, angle = amplitudes(stage, load_sensor("soft_bubble").stiffness)
+    assert x == pytest.approx(6 / 2208.96)
+    assert y == pytest.approx(6 / 1875.92)
+    assert angle == pytest.approx(0.2 / (1608.49 * 0.0448**2))
+
+
+def test_stiff_fingers_are_moved_ten_times_further_than_an_arm_repeats_itself():
+    stage = ElasticityStage(stage="calibrate_elasticity")
+    x, y, angle = amplitudes(stage, load_sensor("gelslim").stiffness)
+    # 0.1 mm and 0.1°, the repeatability that makers warrant
+    assert min(x, y) >= 10 * 1e-4
+    assert angle >= 10 * np.radians(0.1)
+
+
+def test_no_finger_is_pushed_harder_than_the_stage_allows():
+    stage = ElasticityStage(
+        stage="calibrate_elasticity", least_mm=10.0, least_deg=20.0, most_force=9.0, most_torque=0.5
+    )
+    stiffness = np.diag([5000.0, 10000.0, 40.0])
+    assert (amplitudes(stage, stiffness) * np.diag(stiffness) <= np.array([9.0, 9.0, 0.5]) * (1 + 1e-12)).all()
+
+
+def test_no_least_is_asked_where_it_is_zero():
+    stage = ElasticityStage(stage="calibrate_elasticity", least_mm=0.0, least_deg=0.0)
+    stiffness = np.diag([5000.0, 10000.0, 40.0])
+    np.testing.assert_allclose(amplitudes(stage, stiffness), [6 / 5000, 6 / 10000, 0.2 / 40])
