@@ -15,8 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimation.contact_memory import LEAST_AREA, ContactMemory, Touch
 from estimation.tactile_pose import FingerModel, PoseStatus
-from mechanics.readings import Array, ImageReading, Status
+from estimation.torn_depth import MOST_OUTWARD, torn
+from mechanics.readings import Array, ImageReading, Stamp, Status
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -24,24 +26,16 @@ Indices = NDArray[np.integer]
 
 #: columns beyond which pictures are binned: the membrane has no detail that needs more
 MOST_COLUMNS = 320
-#: least depth of a touch [m] ...
+#: least depth of a touch, where one picture is all there is [m] ...
 LEAST_TOUCH = 0.9e-3
-#: ... its least area [m²] ...
-LEAST_AREA = 3e-5
 #: ... and of a face whose edges may show [m]
 LEAST_DEEP = 6e-3
 #: least area of a flat patch [m²]
 LEAST_PATCH = 2e-4
-#: largest hole, over the area of the membrane
-MOST_MISSING = 0.04
-#: a step between neighbours that no membrane has, over the distance between them
-STEEPEST = 3.0
 #: −∇²z of a membrane where too little of it is known [1/m]
 USUAL_CURVATURE = 60.0
 #: half of the stretch over which the membrane's curvature is taken [m]
 CURVED_OVER = 10e-3
-#: how far a membrane may bulge outward [m]
-MOST_OUTWARD = 8e-3
 
 
 @dataclass(frozen=True)
@@ -137,17 +131,21 @@ class Deformation:
 
 
 class DepthReader:
-    """Reads pictures of one finger against its untouched reference."""
+    """Reads pictures of one finger against its untouched reference.
 
-    def __init__(self, finger: FingerModel):
-        """Raises ValueError for a finger whose pictures are not depths."""
+    With a ``memory`` it tells a touch from the trace of a former one, where the pictures come in their order; without,
+    each picture is read by itself.
+    """
+
+    def __init__(self, finger: FingerModel, memory: ContactMemory | None = None):
+        """``memory`` of this finger alone. Raises ValueError for a finger whose pictures are not depths."""
         reference = finger.reference
         if reference.dtype != np.uint16 or reference.ndim != 2:
             raise ValueError(
                 f"{finger.sensor}: its reference is {reference.dtype} of shape {reference.shape}; expected a depth "
                 f"picture, uint16 (h, w)"
             )
-        self._finger = finger
+        self._finger, self._memory = finger, memory
         self._unit = np.float32(finger.described.get("depth_unit", 1e-4))
         self._remap = _rectifying(finger)
         self._factor = -(-finger.camera.width // MOST_COLUMNS)
@@ -167,6 +165,7 @@ class DepthReader:
         self._constant -= _smoothed(self._constant, valid, columns / 40)  # a dome is curved, its blur lies inside it
         self._reference = np.where(valid, binned - self._constant, self._smooth).astype(np.float32)
         turn = finger.camera.X_WC[:2, :3]
+        self._spacing = self._pitch(self._reference, valid)
         self._untouched = Untouched(self._reference, valid, self._across, self._down, turn)
 
     def read(self, image: ImageReading) -> Deformation | Unusable:
@@ -178,9 +177,9 @@ class DepthReader:
         depth, valid = self._binned(picture)
         valid &= self._seen
         depth -= self._constant
-        trouble = _damaged(np.where(valid, self._reference - depth, 0), valid, self._seen, self._pitch(depth, valid))
-        if trouble is not None:
-            return trouble
+        damage = torn(np.where(valid, self._reference - depth, 0), valid, self._seen, self._pitch(depth, valid))
+        if damage:
+            return Unusable(PoseStatus.TORN, damage)
         rim = valid & self._rim
         if rim.any() and (off := abs(float(np.median((self._reference - depth)[rim])))) > MOST_OUTWARD:
             return Unusable(
@@ -192,7 +191,7 @@ class DepthReader:
         valid &= np.abs(depth - calm) < 1.5e-3
         depth = _filled(depth, valid)
         inward = self._reference - depth
-        return self._against_face(depth, inward, valid)
+        return self._against_face(depth, inward, valid, image.stamp)
 
     def _distrusted(self, image: ImageReading) -> Unusable | None:
         """What the reading says of itself, and a picture of one depth."""
@@ -239,21 +238,22 @@ class DepthReader:
     def _pitch(self, depth: Image, valid: Mask) -> float:
         return float(np.median(depth[valid][::7])) / self._K[0, 0] if valid.any() else 1e-3
 
-    def _against_face(self, depth: Image, inward: Image, valid: Mask) -> Deformation | Unusable:
+    def _against_face(self, depth: Image, inward: Image, valid: Mask, stamp: Stamp) -> Deformation | Unusable:
         known = cv2.blur(valid.astype(np.float32), (5, 5))
         calm = cv2.blur(np.where(valid, inward, np.float32(0)), (5, 5)) / np.maximum(known, 1e-3)
         inner = cv2.erode(self._seen.astype(np.uint8), np.ones((5, 5))) > 0
         touched = _largest(inner & (known > 0.5) & (calm > LEAST_TOUCH))
         deepest = float(calm[touched].max(initial=0.0))
         area = float(touched.sum()) * self._pitch(depth, valid) ** 2
-        if area < LEAST_AREA:
-            return Unusable(
-                PoseStatus.NO_CONTACT, f"nothing presses the membrane in by {1e3 * LEAST_TOUCH:.1f} mm anywhere"
-            )
+        touch = Touch(area >= LEAST_AREA, deepest)
+        if self._memory is not None:
+            touch = self._memory.touch(inward, valid, self._spacing, stamp, touch.found)
+        if not touch.found:
+            return Unusable(PoseStatus.NO_CONTACT, _why_untouched(area, deepest))
         if deepest < LEAST_DEEP:
+            deepest = 1e3 * max(deepest, touch.deepest)
             return Unusable(
-                PoseStatus.NO_EDGE,
-                f"pressed in by {1e3 * deepest:.1f} mm; edges show from some {1e3 * LEAST_DEEP:.0f} mm on",
+                PoseStatus.NO_EDGE, f"pressed in by {deepest:.1f} mm; edges show from some {1e3 * LEAST_DEEP:.0f} mm on"
             )
         weights = _plane(depth, touched & valid, self._across, self._down)
         at_plane = 1.0 / (weights[0] + weights[1] * self._across + weights[2] * self._down)
@@ -276,6 +276,12 @@ class DepthReader:
         lift = np.array([[1, 0, 0], [0, 1, 0], [plane[1], plane[2], plane[0]], [0, 0, 1]])
         to_pixels = self._K @ self._finger.camera.X_CW[:3] @ lift
         return plane, to_pixels / to_pixels[2, 2]
+
+
+def _why_untouched(area: float, deepest: float) -> str:
+    if area < LEAST_AREA:
+        return f"nothing presses the membrane in by {1e3 * LEAST_TOUCH:.1f} mm anywhere, or newly"
+    return f"the membrane is {1e3 * deepest:.1f} mm in, and that is what a former touch has left"
 
 
 def _rectifying(finger: FingerModel) -> tuple[NDArray, NDArray] | None:
@@ -310,56 +316,6 @@ def _filled(image: Image, valid: Mask) -> Image:
         if not left.any():
             break
     return np.asarray(out, np.float32)
-
-
-def _damaged(inward: NDArray[np.float32], valid: Mask, seen: Mask, pitch: float) -> Unusable | None:
-    """TORN for parts that are missing, that no membrane can show, or that do not go on where they meet the rest."""
-    gone = (seen & ~valid).astype(np.uint8)
-    whole = max(float(seen.sum()), 1.0)
-    # at the rim a stereo camera loses a pixel now and then: up to two per cent in one place, eight in all
-    clumps = cv2.connectedComponentsWithStats(cv2.morphologyEx(gone, cv2.MORPH_OPEN, np.ones((3, 3))), connectivity=4)
-    largest, all_gone = float(clumps[2][1:, cv2.CC_STAT_AREA].max(initial=0)) / whole, float(gone.sum()) / whole
-    lines = max(_share_of_lines(gone, seen, axis) for axis in (0, 1))
-    if largest > MOST_MISSING or all_gone > 5 * MOST_MISSING or lines > 0.02:
-        return Unusable(PoseStatus.TORN, f"{100 * all_gone:.0f} % of the picture are missing")
-    calm = np.asarray(cv2.medianBlur(inward, 3), np.float32)
-    wild = valid & ((calm < -MOST_OUTWARD) | (np.abs(inward - calm) > 3e-3))
-    if wild.sum() > 0.01 * seen.sum():
-        return Unusable(
-            PoseStatus.TORN, f"{100 * wild.sum() / seen.sum():.0f} % of the picture are depths that no membrane has"
-        )
-    within = valid & (cv2.erode(seen.astype(np.uint8), np.ones((7, 7))) > 0)
-    for axis, name in ((0, "row"), (1, "column")):
-        where = _break(calm, within, axis, pitch)
-        if where is not None:
-            return Unusable(PoseStatus.TORN, f"the picture breaks at {name} {where}")
-    return None
-
-
-def _share_of_lines(gone: NDArray[np.uint8], seen: Mask, axis: int) -> float:
-    """Share of the rows (axis 1) or columns (axis 0) that are missing as a whole."""
-    full = seen.sum(axis=axis)
-    long = full > 20
-    return float((gone.sum(axis=axis)[long] > 0.9 * full[long]).mean()) if long.any() else 0.0
-
-
-def _break(inward: Image, valid: Mask, axis: int, pitch: float) -> int | None:
-    """The row (axis 0) or column (axis 1) at which the field jumps along a long stretch; None where it does not."""
-    if axis == 1:
-        inward, valid = np.ascontiguousarray(inward.T), np.ascontiguousarray(valid.T)
-    # across a step of a field that has slopes and kinks, the slopes on both sides account for most of the change
-    step = inward[1:] - inward[:-1]
-    jump = step[2:-2] - 0.5 * (step[:-4] + step[4:])
-    whole = valid[1:] & valid[:-1]
-    whole = whole[2:-2] & whole[:-4] & whole[4:]
-    run = max(13, inward.shape[1] // 10)
-    weight = cv2.blur(whole.astype(np.float32), (run, 1))
-    mean = cv2.blur(np.where(whole, jump, np.float32(0)), (run, 1)) / np.maximum(weight, 0.5)
-    noise = 1.4826 * float(np.median(np.abs(mean[weight > 0.5]))) if (weight > 0.5).any() else 0.0
-    mean = np.abs(np.where(weight > 0.5, mean, 0))
-    worst = mean.max(axis=1)
-    at = int(worst.argmax())
-    return at + 3 if worst[at] > max(STEEPEST * pitch, 8 * noise) else None
 
 
 def _largest(mask: Mask) -> Mask:

@@ -13,6 +13,7 @@ import numpy as np
 
 from estimation import strip_kernels as kernels
 from estimation.alignment import EXCLUDED
+from estimation.contact_memory import ContactMemory
 from estimation.deformation import Deformation, DepthReader, Unusable
 from estimation.kink_fit import KinkFit
 from estimation.tactile_pose import (
@@ -44,14 +45,18 @@ _NEIGHBOURS = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3, indexing="ij"), axis=-1).r
 
 
 class RidgeStrips:
-    """Matched filter on the ridge, then the kink fitted in strips."""
+    """Matched filter on the ridge, then the kink fitted in strips.
+
+    Whether anything presses is told over time (`estimation.contact_memory`) where pictures come in their order; a first
+    picture is read by itself. Poses do not depend on the pictures before.
+    """
 
     name: ClassVar[str] = "ridge + kink in strips"
 
     def __init__(self, finger: FingerModel, outline: Polygon):
         """``outline`` in the object's frame. Raises ValueError for a finger whose pictures are not depths."""
         self._finger, self._outline = finger, outline
-        self._reader = DepthReader(finger)
+        self._reader = DepthReader(finger, ContactMemory())
         self._boundary = outline.boundary(SPACING)
 
     def estimate(self, image: ImageReading, prior: GraspPrior) -> TactilePose:

@@ -1,10 +1,6 @@
-"""The deformation field of depth pictures that are made by hand, and of a real Soft Bubble."""
+"""The deformation field of depth pictures that are made by hand."""
 
 from __future__ import annotations
-
-import os
-import warnings
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -187,34 +183,3 @@ def test_a_finger_whose_pictures_are_no_depths_is_refused() -> None:
     camera = CameraModel(WIDTH, HEIGHT, K, X_WC=X_FC)
     with pytest.raises(ValueError, match="depth"):
         DepthReader(FingerModel("gelslim", camera, FINGER_IN_EE, np.zeros((HEIGHT, WIDTH, 3), np.uint8)))
-
-
-# -- a real Soft Bubble ------------------------------------------------------------------------------------------------
-
-ROOT = Path(__file__).parents[2]
-FOLDER = Path(os.environ.get("EXTRINSIC_DATA", ROOT.parent / "shared" / "data")) / "softbubble"
-
-
-@pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no recording of a Soft Bubble in {FOLDER}")
-def test_contact_is_seen_in_the_frames_of_the_recording_that_have_it_and_in_no_other() -> None:
-    with np.load(FOLDER / "depth_quarter_all150.npz") as file:
-        depth = file["z_m"].astype(float)
-    depth[(depth <= 0) | (depth > 0.2)] = np.nan
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # pixels without any depth
-        untouched = np.nanmedian(depth[:60], axis=0)
-    every_fourth = np.array([[434 / 4, 0, 313.7 / 4], [0, 434 / 4, 247.5 / 4], [0, 0, 1]])
-    camera = CameraModel(160, 120, every_fourth, X_WC=X_FC)
-    pictures = [encoded(np.nan_to_num(frame)) for frame in (untouched, *depth)]
-    reader = DepthReader(FingerModel("soft_bubble", camera, FINGER_IN_EE, pictures[0], {"depth_unit": 1e-4}))
-    statuses = []
-    for picture in pictures[1:]:
-        found = reader.read(reading(picture))
-        assert isinstance(found, Unusable)  # a touch 5 mm deep by something round: no face
-        statuses.append(found.status)
-    touched = {k for k, status in enumerate(statuses) if status is PoseStatus.NO_EDGE}
-    none = {k for k, status in enumerate(statuses) if status is PoseStatus.NO_CONTACT}
-    assert len(touched) + len(none) == 150
-    # the first touch, frame 62, is 0.9 mm deep on a third of a square centimetre; the trace that the touch leaves in
-    # frame 110 is as deep and seven times as large, so no threshold tells the two apart
-    assert touched - {62} == set(range(63, 110))
