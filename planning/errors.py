@@ -19,7 +19,12 @@ class InfeasiblePlan(Exception):
         super().__init__(step, contact, need, have, by, reason)
 
     def __str__(self) -> str:
-        place = f"{self.by} contact '{self.contact}', step {self.step}: "
+        named = self.by in self.contact.split()  # "ground left" says by itself what it touches
+        place = (
+            f"{self.contact}, step {self.step}: "
+            if named
+            else f"{self.by} contact '{self.contact}', step {self.step}: "
+        )
         if self.reason is not None:
             return place + self.reason
         if not math.isfinite(self.need):

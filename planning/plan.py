@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
 import numpy as np
@@ -14,9 +15,9 @@ from mechanics.elasticity import Elasticity
 from mechanics.friction import Mode
 from mechanics.readings import Array
 
-SCHEMA = 1
+SCHEMA = 2
 
-_POSES = ("ee", "go", "eo", "preload_ee", "preload_go", "unload_ee", "unload_go")
+_POSES = ("ee", "go", "eo", *(f"{part}_{body}" for part in ("preload", "unload") for body in ("ee", "go", "eo")))
 _WRENCHES = ("wrench", "preload_wrench", "unload_wrench")
 _SHAPES = {
     "X_go_gocf": (3,),
@@ -25,8 +26,8 @@ _SHAPES = {
     **dict.fromkeys(("ee", "go", "eo", "wrench"), ("K", 3)),
     **dict.fromkeys(("contact_points", "contact_normals", "contact_forces"), ("K", "C", 2)),
     "contact_mu": ("C",),
-    **dict.fromkeys(("preload_ee", "preload_go", "preload_wrench"), ("M", 3)),
-    **dict.fromkeys(("unload_ee", "unload_go", "unload_wrench"), ("N", 3)),
+    **dict.fromkeys(("preload_ee", "preload_go", "preload_eo", "preload_wrench"), ("M", 3)),
+    **dict.fromkeys(("unload_ee", "unload_go", "unload_eo", "unload_wrench"), ("N", 3)),
 }
 
 
@@ -37,13 +38,16 @@ class Plan:
     Poses (K, 3) are X_W_ee, X_W_go and X_W_eo (None without an extrinsic object). ``wrench`` (K, 3) [N, N, N·m] is of
     the sensor on the go about the grasp centre, axes of W. Contacts: ``contact_points`` and unit
     ``contact_normals`` (K, C, 2) in W, ``contact_forces`` (K, C, 2) as (f_n, f_t) [N], ``contact_modes`` K × C,
-    ``contact_mu`` (C,), ``contact_names`` C; signs as in `mechanics.friction`.
+    ``contact_mu`` (C,), ``contact_names`` C; signs as in `mechanics.friction`. ``contact_bodies`` C pairs (on, by) of
+    ``go``, ``eo`` and ``ground``: which body the contact acts on, and which one it is touched by.
 
-    ``preload_*`` (M, 3): the contact force grows from none to the first step's while the go stays at the first step's
-    pose, both ends included; ``unload_*`` (N, 3): it falls to none at the last pose. ``mass`` [kg], ``com`` (2,) [m]
+    ``preload_*`` (M, 3): the go's force grows from none to the first step's at poses that stay, both ends included;
+    ``unload_*`` (N, 3): it falls to none. A pivoted object is first turned back, over all steps from the last to the
+    first. ``supported``: something else has to hold the extrinsic object during both. ``mass`` [kg], ``com`` (2,) [m]
     in the go's frame and ``gravity`` [m/s²] along −y are what the wrenches carry; ``stiffness`` (3, 3) is the finger's
-    in gocf. ``loss`` is the mean of the program's objective, ``queries`` the number of programs solved, ``time_s``
-    the seconds that took. Arrays are read-only.
+    in gocf. ``planner`` is the optimiser, ``loss`` what it reached, ``queries`` how many trajectories it asked for in
+    ``time_s`` seconds. ``status`` is ``solved``, or ``inaccurate`` where the result misses what was asked for.
+    ``provenance`` is what JSON can hold: how the plan came about. Arrays are read-only.
     """
 
     name: str
@@ -74,6 +78,11 @@ class Plan:
     loss: float = 0.0
     queries: int = 0
     time_s: float = 0.0
+    preload_eo: Array | None = None
+    unload_eo: Array | None = None
+    contact_bodies: tuple[tuple[str, str], ...] | None = None
+    supported: bool = False
+    provenance: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         sizes: dict[str, int] = {"C": len(self.contact_names)}
@@ -89,6 +98,14 @@ class Plan:
                 f" received {len(modes)} rows of {sorted({len(row) for row in modes})}"
             )
         object.__setattr__(self, "contact_modes", modes)
+        bodies = (("go", "ground"),) * sizes["C"] if self.contact_bodies is None else self.contact_bodies
+        object.__setattr__(self, "contact_bodies", tuple((str(on), str(by)) for on, by in bodies))
+        if len(bodies) != sizes["C"]:
+            raise ValueError(f"plan '{self.name}': contact_bodies: expected {sizes['C']}, received {len(bodies)}")
+        try:
+            object.__setattr__(self, "provenance", json.loads(json.dumps(self.provenance, allow_nan=False)))
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"plan '{self.name}': provenance: expected what JSON can hold: {error}") from None
 
     @property
     def steps(self) -> int:
@@ -119,10 +136,11 @@ class Plan:
     def to_dict(self) -> dict[str, Any]:
         """Return what JSON can hold; `from_dict` gives back the same plan, to the last bit."""
         plain: dict[str, Any] = {"schema": SCHEMA}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            plain[field.name] = value.tolist() if isinstance(value, np.ndarray) else value
+        for item in fields(self):
+            value = getattr(self, item.name)
+            plain[item.name] = value.tolist() if isinstance(value, np.ndarray) else value
         plain["contact_names"] = list(self.contact_names)
+        plain["contact_bodies"] = [list(pair) for pair in self.contact_bodies or ()]
         plain["contact_modes"] = [[mode.value for mode in row] for row in self.contact_modes]
         return plain
 
@@ -132,7 +150,7 @@ class Plan:
         schema = plain.get("schema")
         if schema != SCHEMA:
             raise ValueError(f"plan: schema: expected {SCHEMA}, received {schema!r}: plan again with this version")
-        expected, received = {field.name for field in fields(cls)}, set(plain) - {"schema"}
+        expected, received = {item.name for item in fields(cls)}, set(plain) - {"schema"}
         if expected != received:
             wrong = [f"missing {sorted(expected - received)}"] * (not expected <= received)
             wrong += [f"not known {sorted(received - expected)}"] * (not received <= expected)

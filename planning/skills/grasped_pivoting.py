@@ -2,30 +2,42 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
-from planning.skills import stance
-from planning.skills.base import Held, PositiveRamp, Skill, SkillParameters, ramp, register
-from planning.task import Task
-
-Angle = Annotated[float, Field(ge=-180, le=180)]
+from mechanics.friction import Mode
+from planning.problem import Form, Limits, LossWeights
+from planning.skills import on_ground, stance
+from planning.skills.base import (
+    Angle,
+    Disturbance,
+    PositiveRamp,
+    Ramp,
+    Scene,
+    Skill,
+    SkillParameters,
+    SkillTask,
+    Steps,
+    ramp,
+    register,
+)
 
 
 class PivotingParameters(SkillParameters):
     """Grasped pivoting.
 
     ``angle_deg`` the go's first and last tilt, counter-clockwise; ``force`` the normal force of the ground on the
-    go [N], one figure or first and last; ``steps`` how many waypoints; ``contact_x`` [m] where on the ground the corner
-    stands.
+    go [N] and ``tangential`` its force along +x, each one figure or first and last; ``steps`` how many waypoints;
+    ``contact_x`` [m] where on the ground the corner stands; ``disturbance`` [N] that the contact has to bear.
     """
 
     angle_deg: tuple[Angle, Angle] = (10.0, 35.0)
     force: PositiveRamp = (4.0, 4.0)
-    steps: int = Field(default=20, ge=1, le=10_000)
+    tangential: Ramp = (0.0, 0.0)
+    steps: Steps = 20
     contact_x: float = 0.0
+    disturbance: Disturbance = 0.0
 
 
 @register
@@ -33,13 +45,29 @@ class GraspedPivoting(Skill):
     """The go turns about its lowest corner, which sticks and must stay the lowest."""
 
     name: ClassVar[str] = "grasped_pivoting"
-    Parameters: ClassVar[type[SkillParameters]] = PivotingParameters
+    Parameters = PivotingParameters
 
     @staticmethod
-    def task(parameters: PivotingParameters, held: Held) -> Task:
+    def task(
+        parameters: PivotingParameters,
+        scene: Scene,
+        form: Form = Form.CLOSED,
+        weights: LossWeights = LossWeights(),  # noqa: B008 - frozen
+        limits: Limits = Limits(),  # noqa: B008 - frozen
+    ) -> SkillTask:
         """Return the task; see `planning.skills.base.Skill.task`."""
-        theta = np.deg2rad(ramp(parameters.angle_deg, parameters.steps))
-        corner = stance.pivot_corner(held.vertices, theta)
-        force = np.column_stack([ramp(parameters.force, len(theta)), np.zeros(len(theta))])
-        go = stance.standing_pose(corner, theta, parameters.contact_x)
-        return held.task(GraspedPivoting.name, go, stance.sticking_ground_contacts(corner[None], held.mu, force))
+        steps = parameters.steps
+        theta = np.deg2rad(ramp(parameters.angle_deg, steps))
+        return on_ground.grounded_task(
+            GraspedPivoting.name,
+            scene.held,
+            stance.pivot_corner(scene.held.vertices, theta)[None],
+            theta,
+            np.full(steps, parameters.contact_x),
+            Mode.STICK,
+            np.column_stack([ramp(parameters.force, steps), ramp(parameters.tangential, steps)]),
+            parameters.disturbance,
+            form,
+            weights,
+            limits,
+        )

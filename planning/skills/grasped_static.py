@@ -5,11 +5,23 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
-from planning.skills import stance
-from planning.skills.base import Held, PositiveRamp, Ramp, Skill, SkillParameters, ramp, register
-from planning.task import Task
+from mechanics.friction import Mode
+from planning.problem import Form, Limits, LossWeights
+from planning.skills import on_ground, stance
+from planning.skills.base import (
+    Angle,
+    Disturbance,
+    PositiveRamp,
+    Ramp,
+    Scene,
+    Skill,
+    SkillParameters,
+    SkillTask,
+    Steps,
+    ramp,
+    register,
+)
 
 
 class StaticParameters(SkillParameters):
@@ -17,14 +29,15 @@ class StaticParameters(SkillParameters):
 
     ``angle_deg`` the go's tilt, counter-clockwise; ``force`` the normal force of the ground on the go [N], first and
     last; ``tangential`` its force along +x [N], first and last; ``steps`` how many waypoints; ``contact_x`` [m] where
-    on the ground the corner stands (the left one of a face).
+    on the ground the corner stands (the left one of a face); ``disturbance`` [N] that the contact has to bear.
     """
 
-    angle_deg: float = Field(default=15.0, ge=-180, le=180)
+    angle_deg: Angle = 15.0
     force: PositiveRamp = (3.0, 5.0)
     tangential: Ramp = (0.0, 0.0)
-    steps: int = Field(default=20, ge=1, le=10_000)
+    steps: Steps = 20
     contact_x: float = 0.0
+    disturbance: Disturbance = 0.0
 
 
 @register
@@ -32,13 +45,29 @@ class GraspedStatic(Skill):
     """The go stands on its lowest corner, or flat on a face whose two ends share the force evenly."""
 
     name: ClassVar[str] = "grasped_static"
-    Parameters: ClassVar[type[SkillParameters]] = StaticParameters
+    Parameters = StaticParameters
 
     @staticmethod
-    def task(parameters: StaticParameters, held: Held) -> Task:
+    def task(
+        parameters: StaticParameters,
+        scene: Scene,
+        form: Form = Form.CLOSED,
+        weights: LossWeights = LossWeights(),  # noqa: B008 - frozen
+        limits: Limits = Limits(),  # noqa: B008 - frozen
+    ) -> SkillTask:
         """Return the task; see `planning.skills.base.Skill.task`."""
-        theta = np.full(parameters.steps, np.deg2rad(parameters.angle_deg))
-        points = stance.lowest_points(held.vertices, theta[0])
-        force = np.column_stack([ramp(parameters.force, len(theta)), ramp(parameters.tangential, len(theta))])
-        go = stance.standing_pose(points[0], theta, parameters.contact_x)
-        return held.task(GraspedStatic.name, go, stance.sticking_ground_contacts(points, held.mu, force))
+        steps = parameters.steps
+        theta = np.full(steps, np.deg2rad(parameters.angle_deg))
+        return on_ground.grounded_task(
+            GraspedStatic.name,
+            scene.held,
+            stance.lowest_points(scene.held.vertices, float(theta[0])),
+            theta,
+            np.full(steps, parameters.contact_x),
+            Mode.STICK,
+            np.column_stack([ramp(parameters.force, steps), ramp(parameters.tangential, steps)]),
+            parameters.disturbance,
+            form,
+            weights,
+            limits,
+        )

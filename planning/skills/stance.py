@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mechanics import se2
-from mechanics.friction import Mode
 from mechanics.readings import Array
-from planning.task import ContactRequest
 
 LEVEL = 1e-6
 """Vertices this close in height [m] are equally low."""
@@ -57,15 +55,6 @@ def standing_pose(vertex: Array, theta: Array, contact_x: float) -> Array:
     theta = np.atleast_1d(np.asarray(theta, dtype=np.float64))
     offset = se2.rotate(theta, vertex)
     return np.column_stack([contact_x - offset[:, 0], -offset[:, 1], theta])
-
-
-def sticking_ground_contacts(points: Array, mu: float, force: Array) -> tuple[ContactRequest, ...]:
-    """Return sticking contacts at the go's ``points`` (1 or 2, 2) that share ``force`` (K, 2) evenly."""
-    names = ("corner",) if len(points) == 1 else ("left corner", "right corner")
-    return tuple(
-        ContactRequest(name, point, np.array(GROUND_NORMAL), (Mode.STICK,), mu, force / len(points))
-        for name, point in zip(names, points, strict=True)
-    )
 
 
 def _spelled(point: Array) -> str:

@@ -1,0 +1,129 @@
+"""A problem as the flat arrays that the kernels read; built once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mechanics import se2
+from mechanics.friction import tangent
+from planning.fused import layout
+from planning.problem import Form, Problem, Touch
+from planning.program import ContactProgram, codes
+from planning.qp_fused import kinds_of
+
+LENGTH = next(field.default for field in ContactProgram.__dataclass_fields__.values() if field.name == "length")
+
+
+class Packed(NamedTuple):
+    """See `planning.fused.layout`: ``kinds`` (K, C), ``steps`` (K, STEP), ``fixed`` (FIXED,), ``flags`` (FLAGS,),
+    ``free`` (K, 5) as 0 and 1, ``start`` (K, 5)."""
+
+    kinds: NDArray[np.int8]
+    steps: NDArray[np.float64]
+    fixed: NDArray[np.float64]
+    flags: NDArray[np.int64]
+    free: NDArray[np.int8]
+    start: NDArray[np.float64]
+
+
+def pack(problem: Problem) -> Packed:
+    """Return a problem's arrays. Raises ValueError where it has more contacts than a kernel takes."""
+    n, m = len(problem.contacts), len(problem.ground)
+    if n > 2 or m > 2:
+        raise ValueError(
+            f"problem '{problem.skill}': contacts: expected at most 2 of the grasped object and 2 with the ground,"
+            f" received {n} and {m}"
+        )
+    two = problem.eo_body is not None
+    relaxed = (two,) * n + (False,) * m
+    contacts = (*problem.contacts, *problem.ground)
+    mu = np.tile([contact.mu for contact in contacts], (problem.steps, 1))
+    kinds, slope = kinds_of(codes([contact.modes for contact in contacts]).T, mu, relaxed)
+    return Packed(
+        np.ascontiguousarray(kinds),
+        _steps(problem, slope),
+        _fixed(problem),
+        _flags(problem),
+        np.ascontiguousarray(problem.free, dtype=np.int8),
+        np.array(problem.start),
+    )
+
+
+def _steps(problem: Problem, slope: NDArray[np.float64]) -> NDArray[np.float64]:
+    steps = np.zeros((problem.steps, layout.STEP))
+    eo = np.asarray(problem.eo)
+    steps[:, layout.THETA_EO] = eo[:, 2]
+    steps[:, layout.EO_X], steps[:, layout.EO_Y] = eo[:, 0], eo[:, 1]
+    steps[:, layout.ANGLE], steps[:, layout.TRAVEL] = problem.angle, problem.travel
+    steps[:, layout.LOWEST], steps[:, layout.HIGHEST] = problem.angle_limits.T
+    steps[:, layout.WISH : layout.WISH + 2] = sum(contact.wish for contact in problem.contacts)
+    for c, contact in enumerate(problem.contacts):
+        at = layout.OBJECT + 6 * c
+        eo_owns_face = contact.touch is Touch.CORNER_ON_FACE
+        into = -contact.normal if eo_owns_face == (problem.eo_body is not None) else contact.normal
+        steps[:, at : at + 2] = se2.transform(eo, contact.p_eo)
+        if eo_owns_face:
+            steps[:, at + 2 : at + 4] = se2.rotate(eo[:, 2], tangent(contact.normal))
+        steps[:, at + 4 : at + 6] = se2.rotate(eo[:, 2], into) if eo_owns_face else into
+    for g, ground in enumerate(problem.ground):
+        at = layout.GROUND + 2 * g
+        steps[:, at : at + 2] = se2.rotate(eo[:, 2], ground.p_eo)
+    steps[:, layout.SLOPE : layout.SLOPE + slope.shape[1]] = slope
+    return steps
+
+
+def _fixed(problem: Problem) -> NDArray[np.float64]:
+    fixed, K = np.zeros(layout.FIXED), problem.steps
+
+    def put(at: int, values: object) -> None:
+        flat = np.asarray(values, dtype=np.float64).ravel()
+        fixed[at : at + len(flat)] = flat
+
+    rho = problem.go_body.rho
+    put(layout.SCALE, problem.scale)
+    put(layout.GO_WEIGHT, problem.go_body.mass * problem.gravity)
+    put(layout.EO_WEIGHT, problem.eo_body.mass * problem.gravity if problem.eo_body else 0.0)
+    put(layout.RHO, rho)
+    put(layout.LENGTH, LENGTH)
+    put(layout.U_OBJECT, problem.force_weight)
+    put(layout.GRASP, problem.grasp)
+    put(layout.GRASP_TURN, [np.cos(problem.grasp[2]), np.sin(problem.grasp[2])])
+    put(layout.STIFFNESS, problem.stiffness)
+    put(layout.COMPLIANCE, np.linalg.inv(problem.stiffness))
+    for c, contact in enumerate(problem.contacts):
+        put(layout.P_GO + 2 * c, contact.p_go)
+    put(layout.FACE_GO, tangent(problem.contacts[0].normal))
+    put(layout.SLACK, problem.slack_weight * np.array([1.0, 1.0, rho**-2]))
+    names = ("cone", "pull", "smooth", "force", "penetration", "slack", "track", "workspace", "joints", "sensor")
+    put(layout.W_CONE, [(getattr(problem.weights, n) / (max(K - 1, 1) if n == "smooth" else K)) ** 0.5 for n in names])
+    limits = problem.limits
+    if limits.workspace is not None:
+        put(layout.WORK_MIDDLE, limits.workspace.mean(axis=1))
+        put(layout.WORK_HALF, np.diff(limits.workspace, axis=1) / 2)
+    if limits.arm is not None:
+        arm = limits.arm
+        put(layout.BASE, [*arm.base, arm.upper, arm.fore, *arm.tool, arm.elbow, *arm.zero])
+        put(layout.JOINT_MIDDLE, arm.limits.mean(axis=1))
+        put(layout.JOINT_HALF, np.diff(arm.limits, axis=1) / 2)
+    put(layout.MOST_FORCE, limits.force or 0.0)
+    put(layout.MOST_TORQUE, limits.torque or 0.0)
+    return fixed
+
+
+def _flags(problem: Problem) -> NDArray[np.int64]:
+    flags = np.zeros(layout.FLAGS, np.int64)
+    weights, limits = problem.weights, problem.limits
+    flags[layout.PAPER] = problem.form is Form.PAPER
+    flags[layout.TWO_BODIES] = problem.eo_body is not None
+    flags[layout.OBJECTS], flags[layout.GROUNDS] = len(problem.contacts), len(problem.ground)
+    flags[layout.CORNERS] = sum(
+        1 << c for c, contact in enumerate(problem.contacts) if contact.touch is Touch.CORNER_ON_FACE
+    )
+    flags[layout.WORKSPACE] = limits.workspace is not None and weights.workspace > 0
+    flags[layout.JOINTS] = limits.arm is not None and weights.joints > 0
+    flags[layout.MOST_F] = limits.force is not None and weights.sensor > 0
+    flags[layout.MOST_T] = limits.torque is not None and weights.sensor > 0
+    return flags

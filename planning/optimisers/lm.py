@@ -1,0 +1,221 @@
+"""Second order: Levenberg–Marquardt on the Gauss–Newton model, one block tridiagonal solve per step."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numba import njit
+
+from mechanics.readings import Array
+from planning.optimisers.base import Objective, Optimiser, Optimum, Quadratic, register
+from planning.optimisers.block_tridiagonal import damped_solve
+from planning.optimisers.checks import checked_start, require_finite
+
+#: below the least the step is Gauss–Newton's, and a refusal must still be felt; beyond the largest it is rounding
+SMALLEST, LARGEST = 1e-7, 1e16
+#: trials that the model may misjudge before it asks for the curvature
+MISJUDGED = 2
+#: step of the differences that make a Hessian [units of z], and how far its entries may exceed Gauss–Newton's
+DIFFERENCE, JUMP = 1e-5, 30.0
+#: damping that is handed on at most: what stalled one problem need not slow down the next
+LARGEST_HANDED_ON = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """What Gauss–Newton leaves out of a Hessian, Σ 2 r ∇²r: blocks ``diagonal`` (K, D, D) and ``below`` (K−1, D, D)."""
+
+    diagonal: Array
+    below: Array
+
+
+@dataclass
+class Warm:
+    """What one call leaves to the next: the damping that it ended with, and the curvature where it had to ask for it.
+
+    Receding horizon gives the same one to each call.
+    """
+
+    damping: float | None = None
+    curvature: Curvature | None = None
+
+
+@register
+@dataclass
+class LevenbergMarquardt(Optimiser):
+    """Steps δ of (H + λ diag(JᵀJ)) δ = −g, with the damping λ set by the gain ratio (Nielsen 1999).
+
+    A trial is taken where the loss falls; λ then shrinks by up to 3 as the model proves right. Where it does not fall
+    (the gradient jumps where the active set of a program changes) or is not finite (behind a barrier), λ grows by 2, 4,
+    8 … and the step is tried again.
+
+    H is Gauss–Newton's 2 JᵀJ. Where ``exact``, and trials bring less than half of what that promised or half as much
+    again, `curvature` is added to it, which Gauss–Newton leaves out, and kept until it misjudges too. To turn the
+    grasped object about its contact at all steps alike costs next to nothing; in so flat a valley it is all there is.
+
+    ``iterations`` is the most trials; the curve has the loss of the point where it stands after each. A query is a
+    trial or one of the gradients of a curvature, of which there are at most 3 D.
+
+    It has converged where the model promises less than ``loss_tolerance`` of the loss, at this λ or without damping;
+    where the gradient's largest component is below ``gradient_tolerance`` of what it was at the start; or where the
+    step is below ``step_tolerance`` in units of z (about 1 mm, 1 N). It has stalled where the promise or the step got
+    as small by refusals only. ``warm`` carries damping and curvature from call to call.
+    """
+
+    name: ClassVar[str] = "lm"
+    iterations: int = 100
+    loss_tolerance: float = 1e-8
+    gradient_tolerance: float = 1e-10
+    step_tolerance: float = 1e-9
+    damping: float = 1e-3
+    exact: bool = True
+    warm: Warm | None = None
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"lm: iterations: expected at least 1, received {self.iterations}")
+        for name in ("damping", "loss_tolerance", "gradient_tolerance", "step_tolerance"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"lm: {name}: expected a positive number, received {getattr(self, name)}")
+
+    def optimise(self, objective: Objective, z: Array, rng: np.random.Generator) -> Optimum:
+        """Improve ``z`` (K, D); ``rng`` is not used. Raises ValueError where the loss is not finite at ``z``."""
+        z = checked_start(self.name, objective, z)
+        free = np.ascontiguousarray(objective.free, dtype=np.bool_)
+        began = time.perf_counter()
+        model = objective.quadratic(z)
+        require_finite(self.name, model.value)
+        flat = self.gradient_tolerance * _largest(model.gradient, free)
+        warm = self.warm or Warm()
+        damping = self.damping if warm.damping is None else warm.damping
+        growth, curve, queries, misjudged = 2.0, [model.value], 1, 0
+        rest = warm.curvature
+        if rest is None or rest.diagonal.shape != model.diagonal.shape:
+            rest = Curvature(np.zeros_like(model.diagonal), np.zeros_like(model.below))
+        known_here = False  # whether ``rest`` is of this z
+        while True:
+            if _largest(model.gradient, free) <= flat:
+                status = "converged"
+                break
+            z_trial, promised, length, damping = _trial(
+                z, model.gradient, model.diagonal, model.below, rest.diagonal, rest.below, free, damping
+            )
+            if damping > LARGEST:
+                status = "stalled"
+                break
+            refused = growth > 2
+            small = promised <= self.loss_tolerance * model.value or length <= self.step_tolerance
+            # (1 + λ) times the promise is what the diagonal of H alone would promise without damping
+            if (1 + damping) * promised <= self.loss_tolerance * model.value or (small and refused):
+                status = "stalled" if refused else "converged"
+                break
+            if small and damping <= 1:
+                status = "converged"
+                break
+            if len(curve) == self.iterations:
+                status = "iterations"
+                break
+            trial = objective.quadratic(z_trial)
+            queries += 1
+            gain = (model.value - trial.value) / promised if _usable(trial) else 0.0
+            if gain > 0:
+                z, model, known_here = z_trial, trial, False
+                damping, growth = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), SMALLEST), 2.0
+            else:
+                damping, growth = damping * growth, 2 * growth
+            curve.append(model.value)
+            misjudged += not 0.5 < gain < 1.5
+            if self.exact and misjudged >= MISJUDGED and not known_here:
+                rest, asked = curvature(objective, z, model)
+                queries += asked
+                misjudged, known_here = MISJUDGED - 1, True
+                warm.curvature = rest
+        warm.damping = min(damping, LARGEST_HANDED_ON)
+        return Optimum(z, model.value, np.array(curve), queries, time.perf_counter() - began, status)
+
+
+def curvature(objective: Objective, z: Array, model: Quadratic) -> tuple[Curvature, int]:
+    """Return the exact Hessian less Gauss–Newton's ``model`` of it at ``z`` (K, D), and how many gradients that took.
+
+    Forward differences of the gradient. As only neighbours are coupled, every third step is moved at once: 3 D
+    gradients whatever K. Where an active set changes between the two points the difference is a jump over a small
+    number: a column much larger than any of Gauss–Newton's is taken to be Gauss–Newton's.
+    """
+    K, D = z.shape
+    free = objective.free
+    diagonal, below = model.diagonal.copy(), model.below.copy()
+    above = np.swapaxes(below, 1, 2).copy()
+    most, asked = JUMP * max(float(np.abs(diagonal).max()), float(np.abs(below).max(initial=0.0))), 0
+    for first in range(min(3, K)):
+        for i in range(D):
+            moved = np.arange(first, K, 3)
+            moved = moved[free[moved, i]]
+            if not len(moved):
+                continue
+            there = z.copy()
+            there[moved, i] += DIFFERENCE
+            value, gradient = objective.gradient(there)
+            asked += 1
+            if not (np.isfinite(value) and np.isfinite(gradient).all()):
+                continue
+            change = np.where(free, gradient - model.gradient, 0.0) / DIFFERENCE
+            size = np.pad(np.abs(change).max(axis=1), 1)
+            moved = moved[np.max([size[:-2], size[1:-1], size[2:]], axis=0)[moved] < most]
+            lower, upper = moved[moved < K - 1], moved[moved > 0]
+            diagonal[moved, :, i] = change[moved]
+            below[lower, :, i] = change[lower + 1]
+            above[upper - 1, :, i] = change[upper - 1]
+    diagonal = 0.5 * (diagonal + np.swapaxes(diagonal, 1, 2))
+    below = 0.5 * (below + np.swapaxes(above, 1, 2))
+    return Curvature(diagonal - model.diagonal, below - model.below), asked
+
+
+def _usable(model: Quadratic) -> bool:
+    """Whether loss and gradient are finite."""
+    return bool(np.isfinite(model.value) and np.isfinite(model.gradient).all())
+
+
+@njit(cache=True, fastmath=False)
+def _largest(gradient, free):
+    """The largest magnitude (K, D) → float among the free variables."""
+    largest = 0.0
+    for k in range(gradient.shape[0]):
+        for i in range(gradient.shape[1]):
+            if free[k, i]:
+                largest = max(largest, abs(gradient[k, i]))
+    return largest
+
+
+@njit(cache=True, fastmath=False)
+def _trial(z, gradient, diagonal, below, rest_diagonal, rest_below, free, damping):
+    """The damped step's end (K, D), the fall of the loss that the model promises, the step's largest part, the damping.
+
+    Damping grows until H + λ diag(JᵀJ) is positive definite. A variable on which no residual depends has no gradient
+    either; a small floor under the diagonal keeps it where it is.
+    """
+    K, D = z.shape
+    most = 0.0
+    for k in range(K):
+        for i in range(D):
+            if free[k, i]:
+                most = max(most, diagonal[k, i, i])
+    full, full_below = diagonal + rest_diagonal, below + rest_below
+    added, step, down = np.empty((K, D)), np.empty((K, D)), -gradient
+    while damping <= LARGEST:
+        for k in range(K):
+            for i in range(D):
+                added[k, i] = damping * max(diagonal[k, i, i], 1e-8 * most)
+        if damped_solve(full, full_below, down, free, added, step):
+            promised, length = 0.0, 0.0
+            for k in range(K):
+                for i in range(D):
+                    if free[k, i]:
+                        # −gᵀδ − ½ δᵀHδ with H δ = −g − λ diag(JᵀJ) δ
+                        promised += 0.5 * step[k, i] * (added[k, i] * step[k, i] - gradient[k, i])
+                        length = max(length, abs(step[k, i]))
+            return z + step, promised, length, damping
+        damping *= 2.0
+    return z, 0.0, 0.0, damping
