@@ -12,16 +12,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from estimation.contact_location import ContactEstimate, ContactLocator
-from estimation.contact_sites import faces_seen_by, ground_seen_by
-from estimation.contact_wrench import from_force_torque, wrist_covariance
+from estimation.contact_location import ContactEstimate
+from estimation.contact_tracking import ContactTracker
+from estimation.contact_wrench import EnvironmentWrench, from_force_torque, wrist_covariance
 from estimation.force_torque import FreeAirLoad, WristSensor
 from estimation.grasp_filter import GraspFilter
 from estimation.tactile_pose import GraspPrior, PoseStatus, TactilePose
 from estimation.tag_pose import TagPose
+from estimation.wrench_errors import ForceTorqueErrors, Zero
 from mechanics import se2, wrench
 from mechanics.elasticity import Elasticity
-from mechanics.polygon import Polygon
 from mechanics.readings import Array, PoseReading, Status, WrenchReading
 from mechanics.task_plane import TaskPlane
 
@@ -35,8 +35,9 @@ class State:
     """What is known at ``capture_ns``. Poses (3,) in W; None where nothing is known.
 
     ``go_covariance`` (3, 3) is of a left perturbation of X_ee_go about ee's origin, in ee; ``wrench`` (3,) of the
-    sensor on the go about the grasp centre, axes of W, with its covariance; ``contact`` where the environment touches
-    the go, in its frame. ``ages`` [s] of each source at ``capture_ns``; ``status`` of the go's pose and its ``reason``.
+    sensor on the go about the grasp centre, where the fingers are, axes of W, with its covariance; ``contact`` where
+    the environment touches the go, in its frame. ``ages`` [s] of each source at ``capture_ns``; ``status`` of the go's
+    pose and its ``reason``.
     """
 
     capture_ns: int
@@ -99,9 +100,9 @@ class StateEstimator:
     """Joins the readings of one grasp.
 
     ``grasp`` holds the belief about where the object lies in the fingers; ``elasticity`` and ``wrist`` turn readings
-    into displacements; ``window`` [s] is how far back wrenches are averaged, ``wrench_noise`` (3, 3) the covariance of
-    one planar reading in the sensor's frame. ``delays`` [s] by source (``arm``, ``wrist``, ``camera``, ``tactile``) are
-    taken off the capture times. ``locator`` finds the contact, with the ground or with an eo of ``eo_outline``. Not
+    into displacements; ``window`` [s] is how far back wrenches are averaged, ``errors`` what is wrong with them and
+    ``zero`` when and where the wrist was zeroed (None: just now). ``delays`` [s] by source (``arm``, ``wrist``,
+    ``camera``, ``tactile``) are taken off the capture times. ``contact`` follows the contact from state to state. Not
     thread-safe.
     """
 
@@ -110,10 +111,10 @@ class StateEstimator:
     wrist: WristSensor
     load: FreeAirLoad
     window: float = 0.1
-    wrench_noise: Array = field(default_factory=lambda: np.diag([0.03, 0.03, 0.0006]) ** 2)
+    errors: ForceTorqueErrors = field(default_factory=ForceTorqueErrors)
+    zero: Zero | None = None
     delays: Mapping[str, float] = field(default_factory=dict)
-    locator: ContactLocator | None = None
-    eo_outline: Polygon | None = None
+    contact: ContactTracker | None = None
     memory: float = 2.0
 
     def __post_init__(self) -> None:
@@ -175,15 +176,19 @@ class StateEstimator:
     # -- out -----------------------------------------------------------------------------------------------------------
 
     def state(self, capture_ns: int | None = None) -> State:
-        """The state at an instant, by default the newest of which pose and wrench, or a tactile image, tell.
+        """The state at an instant, by default the newest of which pose and wrench, an image or the go's tag tell.
 
-        Raises NoState.
+        The contact is followed from one call to the next. Raises NoState.
         """
-        at = capture_ns if capture_ns is not None else max(min(self._newest()), self._seen.get("tactile", 0))
+        if capture_ns is None:
+            at = max(min(self._newest()), *(self._seen.get(source, 0) for source in ("tactile", "go tag")))
+        else:
+            at = capture_ns
         x, ee, w = self._displacement(at)
         prior = self.grasp.predicted(at, x)
         go = se2.compose(ee, prior.pose)
-        covariance = self._wrench_covariance(at, ee, go)
+        p_W = se2.compose(ee, se2.inverse(x))[:2]
+        covariance = self._wrench_covariance(at, ee, p_W, w)
         status, reason = self._status()
         eo = self._eo
         return State(
@@ -195,7 +200,7 @@ class StateEstimator:
             covariance,
             None if eo is None else eo[1].pose,
             None if eo is None else eo[1].covariance,
-            self._contact(go, w, covariance),
+            self._contact(at, ee, go, prior.covariance, from_force_torque(w, covariance, go, p_W, self.load)),
             {name: (at - seen) * 1e-9 for name, seen in {**self._seen, **self._streams()}.items()},
             status,
             reason,
@@ -206,18 +211,19 @@ class StateEstimator:
             return PoseStatus.SLIPPED, f"the object slipped in the fingers {self.grasp.slips} times since the grasp"
         return (PoseStatus.OK, "") if self._told is None else self._told[1:]
 
-    def _contact(self, go: Array, w: Array, covariance: Array) -> ContactEstimate | None:
-        if self.locator is None:
+    def _contact(
+        self, at: int, ee: Array, go: Array, go_covariance: Array, on_go: EnvironmentWrench
+    ) -> ContactEstimate | None:
+        if self.contact is None:
             return None
-        p_W = se2.compose(go, self.grasp.X_go_gocf)[:2]
-        wrench_ = from_force_torque(w, covariance, go, p_W, self.load)
-        around = [ground_seen_by(go)]
-        if self.eo_outline is not None and self._eo is not None:
-            around += faces_seen_by(se2.between(go, self._eo[1].pose), self.eo_outline)
-        return self.locator.locate(wrench_, around)
+        # ee's origin and the fingers' centre are millimetres apart: one point for the pose's error
+        R = np.eye(3)
+        R[:2, :2] = se2.rotation(ee[2] - go[2])
+        eo = None if self._eo is None else self._eo[1].pose
+        return self.contact.at(at, go, R @ go_covariance @ R.T, eo, on_go)
 
     def _displacement(self, at: int) -> tuple[Array, Array, Array]:
-        """x (3,) in gocf, X_W_ee (3,), and the wrench (3,) about the grasp centre in axes of W, at an instant."""
+        """x (3,) in gocf, X_W_ee (3,), and the wrench (3,) about ee ∘ x⁻¹ in axes of W, at an instant."""
         self._newest()
         ee = self._ee.at(at)
         reading = self._wrench.within(at - round(self.window * 1e9), at).mean(axis=0)
@@ -228,10 +234,12 @@ class StateEstimator:
             gocf = se2.compose(ee, se2.inverse(x))
         return x, ee, w
 
-    def _wrench_covariance(self, at: int, ee: Array, go: Array) -> Array:
+    def _wrench_covariance(self, at: int, ee: Array, p_W: Array, w: Array) -> Array:
         count = len(self._wrench.within(at - round(self.window * 1e9), at))
-        p_W = se2.compose(go, self.grasp.X_go_gocf)[:2]
-        return wrist_covariance(self.wrench_noise / count, se2.compose(ee, self.wrist.X_ee_s), p_W)
+        X_W_s = se2.compose(ee, self.wrist.X_ee_s)
+        load = wrench.rotated(wrench.about(w, p_W, X_W_s[:2]), -X_W_s[2])
+        zero = Zero(at, ee) if self.zero is None else self.zero
+        return wrist_covariance(zero.covariance(self.errors, self.wrist, at, ee, load, count), X_W_s, p_W)
 
     def _newest(self) -> tuple[int, int]:
         ee, force = self._ee.newest, self._wrench.newest

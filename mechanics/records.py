@@ -21,11 +21,30 @@ class PlanarState:
 
 
 @dataclass(frozen=True, slots=True)
+class ContactBelief:
+    """Where the environment is believed to touch the go, in its frame.
+
+    ``points`` (H, 2) [m] are the places that explain the wrench, the likeliest first, and ``weights`` (H,) how likely.
+    ``status`` is ``ok`` where they are one answer, else why the place is not known.
+    """
+
+    status: str
+    points: Array
+    weights: Array
+
+    @property
+    def point(self) -> Array | None:
+        """The place (2,) [m], where it is known."""
+        return self.points[0] if self.status == "ok" else None
+
+
+@dataclass(frozen=True, slots=True)
 class WaypointRecord:
     """One settled waypoint of a trial: planned (anchored to the table), commanded ee pose, measured, and true.
 
     ``estimated`` is what the controller was told of this instant, where it asks for more than what is measured (from
-    the tactile images, say). ``truth`` is the plant's own state, filled in by the runner in simulation only.
+    the tactile images, say), ``contact`` where the go was believed to be touched. ``truth`` is the plant's own state,
+    filled in by the runner in simulation only.
     """
 
     capture_ns: int
@@ -36,6 +55,7 @@ class WaypointRecord:
     measured: PlanarState
     truth: PlanarState | None = None
     estimated: PlanarState | None = None
+    contact: ContactBelief | None = None
 
 
 @dataclass(frozen=True, slots=True)

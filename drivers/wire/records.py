@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.errors import ProtocolError
 from drivers.wire import messages
-from mechanics.records import EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
+from mechanics.records import ContactBelief, EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
 
 Record = WaypointRecord | TrialRecord | PhaseRecord | EventRecord
 
@@ -22,6 +22,8 @@ STREAMS: dict[type, tuple[str, str]] = {
 
 _KINDS = {type_name: kind for kind, (_, type_name) in STREAMS.items()}
 _STATE = "extrinsic_msgs/msg/PlanarState"
+_CONTACT = "extrinsic_msgs/msg/ContactBelief"
+_NOWHERE = ContactBelief("", np.empty((0, 2)), np.empty(0))
 
 
 def encode_record(record: Record) -> bytes:
@@ -39,6 +41,8 @@ def encode_record(record: Record) -> bytes:
             "truth": _state(record.measured if truth is None else truth),
             "has_estimate": estimate is not None,
             "estimated": _state(record.measured if estimate is None else estimate),
+            "has_contact": record.contact is not None,
+            "contact": _contact(record.contact or _NOWHERE),
         }
     else:
         fields = {name: getattr(record, name) for name in record.__dataclass_fields__ if name != "capture_ns"}
@@ -63,6 +67,7 @@ def decode_record(type_name: str, payload: bytes) -> Record:
             _planar(value.measured),
             _planar(value.truth) if value.has_truth else None,
             _planar(value.estimated) if value.has_estimate else None,
+            _belief(value.contact) if value.has_contact else None,
         )
     names = [name for name in kind.__dataclass_fields__ if name != "capture_ns"]
     return kind(capture_ns, *(getattr(value, name) for name in names))
@@ -88,6 +93,23 @@ def _planar(value: Any) -> PlanarState:
         value.eo.copy() if value.has_eo else None,
         value.wrench.copy(),
     )
+
+
+def _contact(belief: ContactBelief) -> Any:
+    return messages.message(
+        _CONTACT,
+        status=belief.status,
+        x=_doubles(belief.points[:, 0]),
+        y=_doubles(belief.points[:, 1]),
+        weights=_doubles(belief.weights),
+    )
+
+
+def _belief(value: Any) -> ContactBelief:
+    if not len(value.x) == len(value.y) == len(value.weights):
+        got = f"{len(value.x)} x, {len(value.y)} y and {len(value.weights)} weights"
+        raise ProtocolError("wire", "read where a contact was believed", got, "Expected one of each for every place")
+    return ContactBelief(value.status, np.stack([value.x, value.y], axis=-1), value.weights.copy())
 
 
 def _doubles(values: Any) -> Any:

@@ -24,7 +24,7 @@ from mechanics.readings import (
     TruthReading,
     WrenchReading,
 )
-from mechanics.records import EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
+from mechanics.records import ContactBelief, EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
 from mechanics.task_plane import TaskPlane
 
 STOCK = get_typestore(Stores.ROS2_HUMBLE)
@@ -221,8 +221,24 @@ def test_a_tags_homography_takes_its_square_to_its_corners() -> None:
 
 
 states = st.builds(PlanarState, vectors(3), st.none() | vectors(3), st.none() | vectors(3), vectors(3))
+beliefs = st.integers(0, 4).flatmap(
+    lambda count: st.builds(
+        ContactBelief, names, vectors(2 * count).map(lambda values: values.astype(float).reshape(-1, 2)), vectors(count)
+    )
+)
 records = st.one_of(
-    st.builds(WaypointRecord, captures, names, st.integers(0, 10**6), states, vectors(3), states, st.none() | states),
+    st.builds(
+        WaypointRecord,
+        captures,
+        names,
+        st.integers(0, 10**6),
+        states,
+        vectors(3),
+        states,
+        st.none() | states,
+        st.none() | states,
+        st.none() | beliefs,
+    ),
     st.builds(TrialRecord, captures, names, names, names, names, names, names),
     st.builds(PhaseRecord, captures, names, names),
     st.builds(EventRecord, captures, names, names),
