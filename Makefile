@@ -16,6 +16,7 @@ help:  ## list the targets
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@echo "setting up .venv (about two minutes on a fresh machine) ..."
 	@$(BIN)/python -m pip install --quiet -e '.[dev]'
+	@$(BIN)/python -m experiments.kernels
 	@touch $@
 
 setup: .venv/.installed  ## create .venv and install the project into it

@@ -22,11 +22,12 @@ class Deviation:
 
 @dataclass
 class ContactMonitor:
-    """Watches the planned contacts of the go at the waypoints.
+    """Watches the planned contacts of the go, and those of the extrinsic object with the ground, at the waypoints.
 
     ``load`` is the fraction of the planned contact force below which a contact counts as lost. ``lies`` (3,) is the
     pose of the go as it was seen before touch-down, in the frame of where the plan has it: a contact that lands
-    elsewhere because the go lies otherwise in the fingers has not slipped, it has to stick where it landed.
+    elsewhere because the go lies otherwise in the fingers has not slipped, it has to stick where it landed. A contact
+    of the two objects has to stick where the extrinsic one is seen to carry it.
     """
 
     plan: Plan
@@ -52,28 +53,46 @@ class ContactMonitor:
                 f"waypoint {step}: {float(environment @ planned) / size:.2f} N along the planned contact force "
                 f"of {size:.2f} N",
             )
-        if measured.go is not None:
-            return self._slip(step, measured.go)
-        return None
+        return self._slip(step, measured)
 
-    def _slip(self, step: int, go: Array) -> Deviation | None:
-        for c, name in enumerate(self.plan.contact_names):
-            if self.plan.contact_modes[step][c] != "stick":
+    def _slip(self, step: int, measured: PlanarState) -> Deviation | None:
+        plan = self.plan
+        for c, name in enumerate(plan.contact_names):
+            if plan.contact_modes[step][c] != "stick":
                 continue
-            planned = self.plan.contact_points[step, c]
-            body_point = se2.transform(se2.inverse(self.plan.go[step]), planned)
-            stood = planned + self._landed(step, c, body_point)
-            moved = float(np.linalg.norm(se2.transform(go, body_point) - stood))
+            planned = stood = plan.contact_points[step, c]
+            body, planned_body = measured.go, plan.go[step]
+            if plan.eo is not None and not touches_go(plan, c):
+                body, planned_body = measured.eo, plan.eo[step]
+            else:
+                if plan.eo is not None and measured.eo is not None:
+                    stood = _carried(measured.eo, plan.eo[step], planned)
+                stood = stood + self._landed(step, c)
+            if body is None:
+                continue
+            moved = float(np.linalg.norm(_carried(body, planned_body, planned) - stood))
             if moved > self.slip_tolerance:
                 return Deviation(
                     "slipped", f"waypoint {step}: contact '{name}' is {moved * 1e3:.1f} mm from where it should stick"
                 )
         return None
 
-    def _landed(self, step: int, contact: int, body_point: Array) -> Array:
-        """How far (2,) along the surface, in W, the contact landed from where the plan has it."""
+    def _landed(self, step: int, contact: int) -> Array:
+        """How far (2,) along the surface, in W, the contact of the go landed from where the plan has it."""
         if self.lies is None:
             return np.zeros(2)
-        off = se2.rotate(self.plan.go[0, 2], se2.transform(self.lies, body_point) - body_point)
-        normal = self.plan.contact_normals[step, contact]
+        plan = self.plan
+        body_point = se2.transform(se2.inverse(plan.go[step]), plan.contact_points[step, contact])
+        off = se2.rotate(plan.go[0, 2], se2.transform(self.lies, body_point) - body_point)
+        normal = plan.contact_normals[step, contact]
         return off - (off @ normal) * normal
+
+
+def touches_go(plan: Plan, contact: int) -> bool:
+    """Whether a contact of a plan is one of the go's."""
+    return plan.contact_bodies is None or "go" in plan.contact_bodies[contact]
+
+
+def _carried(body: Array, planned_body: Array, point: Array) -> Array:
+    """Where ``point`` (2,) of a body that the plan has at ``planned_body`` (3,) is with the body at ``body`` (3,)."""
+    return se2.transform(body, se2.transform(se2.inverse(planned_body), point))

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NoReturn
 
 import numpy as np
 
+from control.witness import TableWitness
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import Arm, ForceTorqueSensor, TactileSensor, TagCamera
 from estimation.force_torque import FreeAirLoad, WristSensor, mean_wrench
 from estimation.state import State, StateEstimator
 from estimation.tactile_pose import PoseStatus, TactilePoseEstimator, fuse
 from estimation.tag_pose import TagPose, estimate_planar_pose
-from mechanics import se2
+from estimation.tool_identification import Agreement
+from estimation.wrench_errors import ForceTorqueErrors, Zero
+from mechanics import se2, wrench
 from mechanics.camera import CameraModel, TagGeometry
 from mechanics.readings import Array, Status, TagDetection
-from mechanics.records import PlanarState
+from mechanics.records import ContactBelief, PlanarState
+
+#: older readings of arm and wrist are not gone through when the state is asked for anew [ns]
+_RECENT = 500_000_000
 
 
 @dataclass(frozen=True)
@@ -33,7 +39,8 @@ class Observer:
 
     ``tags`` maps a body (``table``, ``go``, ``eo``) to the tags it carries; ``grasp`` is X_go_gocf; ``window_ns`` is
     how far back wrench readings are averaged. With ``fingers`` and a ``state`` estimator of this grasp, `estimate`
-    learns the go's pose from ``tactile_frames`` pictures of each finger, and never from its tag.
+    learns the go's pose from ``tactile_frames`` pictures of each finger, and never from its tag. Without ``fingers``
+    the ``state`` takes the tags. ``witness`` is the sensor under the table, where there is one.
     """
 
     arm: Arm
@@ -48,9 +55,12 @@ class Observer:
     fingers: tuple[Finger, ...] = ()
     state: StateEstimator | None = None
     tactile_frames: int = 1
+    witness: TableWitness | None = None
     #: the state behind the newest `estimate` from the fingers
     felt: State | None = None
     _heard_ns: int = -1
+    _zero: Zero | None = None
+    _seen: dict[str, tuple[int, TagPose]] = field(default_factory=dict)
 
     def see(self, bodies: tuple[str, ...]) -> dict[str, TagPose | None]:
         """Poses in W of the named bodies from fresh camera frames; None where none of its tags was seen."""
@@ -61,9 +71,12 @@ class Observer:
             _distrust(self.camera.name, "see the tags", frames[-1].stamp.status)
         for frame in trusted:
             detections += frame.detections
-        return {
+        found = {
             body: estimate_planar_pose(self.camera_model, tuple(detections), self.tags.get(body, ())) for body in bodies
         }
+        at = trusted[-1].stamp.capture_ns
+        self._seen |= {body: (at, pose) for body, pose in found.items() if pose is not None}
+        return found
 
     def arm_pose(self) -> Array:
         """X_W_ee (3,) now. Raises DeviceFault where the arm's own reading is not to be trusted."""
@@ -91,8 +104,7 @@ class Observer:
         go = None if seen["go"] is None else seen["go"].pose
         eo = None if seen["eo"] is None else seen["eo"].pose
         grasp_centre = se2.compose(ee if go is None else go, np.zeros(3) if go is None else self.grasp)
-        wrench = self.wrist_sensor.wrench_on_go(reading, ee, grasp_centre[:2])
-        return PlanarState(ee, go, eo, wrench)
+        return PlanarState(ee, go, eo, self.wrist_sensor.wrench_on_go(reading, ee, grasp_centre[:2]))
 
     def estimate(self) -> PlanarState:
         """What controllers act on, at this instant: from the fingers and the elasticity where there are fingers.
@@ -104,6 +116,7 @@ class Observer:
         for _ in range(self.tactile_frames):
             self._feel(self.state)
         extrinsic = self.see(("eo",))["eo"] if self.tags.get("eo") else None
+        self._push_tag(self.state, "eo")
         now = self.state.state()
         if "tactile" not in now.ages:
             raise DeviceFault(
@@ -118,18 +131,61 @@ class Observer:
     def _feel(self, state: StateEstimator) -> None:
         """Take in one picture of each finger, and what arm and wrist have said until then."""
         pictures = [finger.sensor.capture() for finger in self.fingers]
-        readings = [*self.arm.since(self._heard_ns), self.arm.latest()]
-        for pose in readings:
-            state.push_pose(pose)
-        wrenches = self.wrist.since(self._heard_ns)
-        for wrench in wrenches:
-            state.push_wrench(wrench)
-        heard = [r.stamp.capture_ns for r in (*readings, *wrenches)]
-        self._heard_ns = max([self._heard_ns, *heard])
+        self._hear(state)
         at = pictures[0].stamp.capture_ns
         prior = state.expected(at)
         found = fuse(prior, [f.method.estimate(image, prior) for f, image in zip(self.fingers, pictures, strict=True)])
         state.push_tactile(at, prior, found)
+
+    def _hear(self, state: StateEstimator) -> None:
+        """Take in what arm and wrist have said of late."""
+        newest = self.arm.latest()
+        after = max(self._heard_ns, newest.stamp.capture_ns - _RECENT)
+        poses, wrenches = [*self.arm.since(after), newest], self.wrist.since(after)
+        for pose in poses:
+            state.push_pose(pose)
+        for reading in wrenches:
+            state.push_wrench(reading)
+        self._heard_ns = max([after, *(r.stamp.capture_ns for r in (*poses, *wrenches))])
+
+    def _push_tag(self, state: StateEstimator, body: str) -> None:
+        """Take in where a body's tags were seen last, once."""
+        seen = self._seen.pop(body, None)
+        if seen is not None:
+            state.push_tag(body, *seen)
+
+    def state_now(self) -> State | None:
+        """The whole state at a settled instant, after `measure`; None without a ``state`` estimator.
+
+        It is the one that controllers were told of where there are fingers, and the tags' otherwise.
+        """
+        if self.state is None or self.fingers:
+            return self.felt
+        self._hear(self.state)
+        for body in ("go", "eo"):
+            self._push_tag(self.state, body)
+        return self.state.state()
+
+    def contact(self) -> ContactBelief | None:
+        """Where the go is believed to be touched, of `state_now`; None where nobody looks for it."""
+        now = self.state_now()
+        if now is None or now.contact is None:
+            return None
+        found = now.contact.hypotheses
+        points = np.array([one.point for one in found]).reshape(-1, 2)
+        return ContactBelief(now.contact.status.value, points, np.array([one.weight for one in found]))
+
+    def second_opinion(self, measured: PlanarState) -> Agreement | None:
+        """What the sensor under the table says of the wrench in ``measured``; None where it says nothing."""
+        if self.witness is None or self._zero is None:
+            return None
+        now, X_W_s = self.wrist.latest().stamp.capture_ns, se2.compose(measured.ee, self.wrist_sensor.X_ee_s)
+        readings = max(1, len(self.wrist.since(now - self.window_ns)))
+        # its torque is of no interest here, so the load is told about any point
+        load = wrench.rotated(measured.wrench * [1.0, 1.0, 0.0], -X_W_s[2])
+        own = self._zero.covariance(ForceTorqueErrors(), self.wrist_sensor, now, measured.ee, load, readings)[:2, :2]
+        R = se2.rotation(X_W_s[2])
+        return self.witness.compare(now, measured.wrench, R @ own @ R.T)
 
     @property
     def slip(self) -> str:
@@ -137,11 +193,15 @@ class Observer:
         return self.felt.reason if self.felt is not None and self.felt.status is PoseStatus.SLIPPED else ""
 
     def zero(self, load: FreeAirLoad, X_W_go: Array) -> None:
-        """Take the wrist sensor's offset in free air, with the go at ``X_W_go`` and only its weight on the sensor."""
+        """Take the offsets in free air: the wrist's, under the weight of a go at ``X_W_go`` alone, and the table's."""
         ee = self.arm_pose()
         self.wrist_sensor = self.wrist_sensor.zeroed(self.mean_reading(), ee, X_W_go, self.grasp, load)
+        now = self.wrist.latest().stamp.capture_ns
+        self._zero = Zero(now, ee)
         if self.state is not None:
-            self.state.wrist = self.wrist_sensor
+            self.state.wrist, self.state.zero = self.wrist_sensor, self._zero
+        if self.witness is not None:
+            self.witness.zero(now)
 
 
 def _distrust(device: str, asked: str, status: Status) -> NoReturn:

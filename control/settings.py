@@ -18,8 +18,10 @@ class TrialSettings(BaseModel):
     settle_timeout: float = Field(default=2.0, gt=0, le=60, description="longest wait for the wrench to rest [s]")
     settle_force: float = Field(default=0.01, gt=0, description="change of the mean from window to window [N]")
     window: float = Field(default=0.1, gt=0, le=2, description="averaging window of the wrench [s]")
-    go_pose: Literal["tags", "tactile"] = Field(
-        default="tags", description="where controllers learn the grasped object's pose from"
+    go_pose: Literal["auto", "tags", "tactile"] = Field(
+        default="auto",
+        description="where controllers learn the grasped object's pose from; auto: from the fingers where their "
+        "elasticity with this object is identified, else from the tag",
     )
     tactile_frames: int = Field(default=2, ge=1, le=30, description="pictures of each finger for an estimate")
     tag_frames: int = Field(default=1, ge=1, le=100, description="camera frames averaged per measurement")

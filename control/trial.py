@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from control.approach import anchored, resting_eo, retreat
 from control.base import Controller
 from control.monitor import ContactMonitor
 from control.motion import Mover
@@ -18,20 +19,25 @@ from control.settings import TrialSettings
 from drivers.errors import CommandRefused, DriverError, SimulationDiverged
 from drivers.interfaces import Clock
 from estimation.force_torque import FreeAirLoad
+from estimation.tool_identification import Agreement
 from mechanics import se2
 from mechanics.readings import Array
-from mechanics.records import PlanarState, WaypointRecord
+from mechanics.records import ContactBelief, PlanarState, WaypointRecord
 from planning.plan import Plan
 
 
 @dataclass
 class TrialResult:
-    """How a trial ended (statuses of design §6) and what it recorded. ``plan`` is the plan as anchored."""
+    """How a trial ended (statuses of design §6) and what it recorded. ``plan`` is the plan as anchored.
+
+    ``witness`` is what the sensor under the table said of the wrist's force, at the waypoints where it said anything.
+    """
 
     status: str
     reason: str
     plan: Plan
     waypoints: list[WaypointRecord] = field(default_factory=list)
+    witness: list[Agreement] = field(default_factory=list)
 
 
 @dataclass
@@ -71,7 +77,7 @@ class Trial:
         self._observer, self._clock, self._load = observer, clock, load
         self._settings, self._watch = settings, watch
         self._result = TrialResult("completed", "", plan)
-        self._slip_told = False
+        self._slip_told = self._witness_told = False
         self._mover = Mover(
             observer.arm, clock, settings.control_rate, observer.arm_pose(), settings.approach_speed, watch.tick
         )
@@ -103,7 +109,7 @@ class Trial:
     def _protocol(self) -> None:
         s, mover = self._settings, self._mover
         self._watch.phase("approach", 0.0)
-        go_air = self._lifted(self._nominal.preload_go[0])
+        go_air = self._lifted(self._nominal)
         self._go_above(self._nominal.free_air_ee(go_air))
         self._settle()
         plan = self._anchored(go_air)
@@ -112,7 +118,7 @@ class Trial:
         lies = None if controller.feedback else se2.between(go_air, self._go_seen)
         monitor = ContactMonitor(plan, s.slip_tolerance_mm * 1e-3, s.force_limit, lies=lies)
 
-        go_air = self._lifted(plan.preload_go[0])
+        go_air = self._lifted(plan)
         ee_air = plan.free_air_ee(go_air)
         mover.travel(controller.command(go_air, ee_air))
         self._settle()
@@ -130,10 +136,10 @@ class Trial:
         steps = len(plan.ee)
         for k in range(steps):
             self._watch.phase("trajectory", k / steps)
-            measured, commanded, estimated = self._visit(controller, plan, k)
+            measured, commanded, estimated, contact = self._visit(controller, plan, k)
             planned = PlanarState(plan.ee[k], plan.go[k], None if plan.eo is None else plan.eo[k], plan.wrench[k])
             record = WaypointRecord(
-                self._clock.now_ns(), self._name, k, planned, commanded, measured, estimated=estimated
+                self._clock.now_ns(), self._name, k, planned, commanded, measured, None, estimated, contact
             )
             self._result.waypoints.append(record)
             self._watch.waypoint(record)
@@ -143,11 +149,13 @@ class Trial:
 
         self._watch.phase("unload", 0.0)
         path = [controller.command(go, ee) for go, ee in zip(plan.unload_go, plan.unload_ee, strict=True)]
-        mover.through(np.array(path), s.preload)
+        mover.through(np.array(path), s.preload + s.ramp * max(0, len(path) - len(plan.preload_go)))
         self._leave()
         self._watch.phase("done", 1.0)
 
-    def _visit(self, controller: Controller, plan: Plan, k: int) -> tuple[PlanarState, Array, PlanarState | None]:
+    def _visit(
+        self, controller: Controller, plan: Plan, k: int
+    ) -> tuple[PlanarState, Array, PlanarState | None, ContactBelief | None]:
         """Go to waypoint ``k``, let the controller correct it, and measure once settled."""
         s, mover = self._settings, self._mover
         mover.ramp(controller.command(plan.go[k], plan.ee[k]), s.ramp)
@@ -157,8 +165,24 @@ class Trial:
             self._tell_slip()
             mover.ramp(controller.command(plan.go[k], plan.ee[k]), s.ramp)
             self._settle()
-        estimated = self._observer.estimate() if self._observer.fingers and controller.feedback else None
-        return self._observer.measure(), mover.pose, estimated
+        estimated = self._observer.estimate() if self._observer.fingers else None
+        measured = self._observer.measure()
+        self._hear_witness(k, measured)
+        return measured, mover.pose, estimated, self._observer.contact()
+
+    def _hear_witness(self, k: int, measured: PlanarState) -> None:
+        found = self._observer.second_opinion(measured)
+        if found is None:
+            return
+        self._result.witness.append(found)
+        if not found.agrees and not self._witness_told:
+            self._witness_told = True
+            dx, dy = found.difference
+            self._watch.event(
+                "warning",
+                f"waypoint {k}: the wrist's force and the one under the table differ by ({dx:+.2f}, {dy:+.2f}) N, more "
+                f"than their errors allow: check both sensors, and what touches the table besides the objects",
+            )
 
     def _tell_slip(self) -> None:
         if self._observer.slip and not self._slip_told:
@@ -175,11 +199,15 @@ class Trial:
                 break
 
     def _anchored(self, go_expected: Array) -> Plan:
-        """Verify the start by tags, zero the wrist sensor under the go's weight, and anchor the plan to the table."""
-        seen = self._observer.see(("table", "go"))
+        """Verify the start by tags, zero the wrist sensor under the go's weight, and anchor the plan.
+
+        It is anchored to the table and, along it, to the extrinsic object.
+        """
+        bodies = ("table", "go") if self._nominal.eo is None else ("table", "go", "eo")
+        seen = self._observer.see(bodies)
         problem = self._start_problem(seen, go_expected)
         if problem is not None and self._watch.reset_scene(problem):
-            seen = self._observer.see(("table", "go"))
+            seen = self._observer.see(bodies)
             problem = self._start_problem(seen, go_expected)
         if problem is not None:
             raise _Ended("stopped", f"the start could not be verified: {problem}")
@@ -187,26 +215,36 @@ class Trial:
         assert table is not None and go is not None  # _start_problem saw both
         self._go_seen = go.pose
         self._observer.zero(self._load, go.pose)
-        return self._nominal.reanchored(table.pose)
+        eo = seen.get("eo")
+        return anchored(self._nominal, table.pose, None if eo is None else eo.pose)
 
     def _start_problem(self, seen: dict, go_expected: Array) -> str | None:
-        s = self._settings
-        for body in ("table", "go"):
-            if seen[body] is None:
+        for body, pose in seen.items():
+            if pose is None:
                 return f"no tag of '{body}' is in view"
-        off = se2.between(go_expected, seen["go"].pose)
+        problem = self._astray("the grasped object", "the grasp should have it", seen["go"].pose, go_expected)
+        lies = resting_eo(self._nominal)
+        if problem is None and lies is not None:
+            on_table = se2.between(seen["table"].pose, seen["eo"].pose)
+            problem = self._astray("the extrinsic object", "the plan begins", on_table, lies)
+        return problem
+
+    def _astray(self, what: str, where: str, seen: Array, expected: Array) -> str | None:
+        s = self._settings
+        off = se2.between(expected, seen)
         distance, angle = float(np.hypot(off[0], off[1])) * 1e3, abs(float(np.degrees(off[2])))
         if distance > s.start_tolerance_mm or angle > s.start_tolerance_deg:
             return (
-                f"the grasped object is {distance:.1f} mm and {angle:.1f} deg from where the grasp should have it "
+                f"{what} is {distance:.1f} mm and {angle:.1f} deg from where {where} "
                 f"(tolerance {s.start_tolerance_mm:g} mm, {s.start_tolerance_deg:g} deg)"
             )
         return None
 
     # -- motions -------------------------------------------------------------------------------------------------
 
-    def _lifted(self, pose: Array) -> Array:
-        return pose + np.array([0.0, self._settings.clearance_mm * 1e-3, 0.0])
+    def _lifted(self, plan: Plan) -> Array:
+        """X_W_go (3,) a clearance off what the go touches first."""
+        return plan.preload_go[0] + self._settings.clearance_mm * 1e-3 * np.append(retreat(plan), 0.0)
 
     def _go_above(self, goal: Array) -> None:
         """Travel to ``goal`` in free air: first up, then across, then down, so that nothing is swept off the table."""
@@ -237,7 +275,7 @@ class Trial:
             before = now
 
     def _leave(self) -> None:
-        """Lift the go off the table from wherever the trial ended."""
+        """Take the go off what it touches from wherever the trial ended."""
         self._watch.phase("retreat", 0.0)
-        up = self._mover.pose + np.array([0.0, 2 * self._settings.clearance_mm * 1e-3, 0.0])
-        self._mover.travel(up)
+        off = 2 * self._settings.clearance_mm * 1e-3 * np.append(retreat(self._result.plan), 0.0)
+        self._mover.travel(self._mover.pose + off)

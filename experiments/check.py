@@ -4,28 +4,43 @@ from __future__ import annotations
 
 from math import inf
 
+from control.approach import resting_eo as resting
 from drivers.config import ForceTorqueConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
 from experiments.calibrate.schema import CameraStage, FrictionStage
 from experiments.calibrate.store import Calibrations, load
 from experiments.files import Resolved
-from experiments.schema import ExecuteStage, PlanStage
-from experiments.setup import Believed, believed, scene, task
+from experiments.planning.files import plan_files
+from experiments.planning.make import resting_eo, task
+from experiments.planning.schema import PlanStage
+from experiments.schema import ExecuteStage
+from experiments.setup import Believed, believed, go_pose, has_fingers, scene
 from mechanics.yaml_input import InputError, Problem
-from planning.task import Task
+from planning.errors import InfeasiblePlan
+from planning.plan import Plan
+from planning.skills.base import SkillTask
 
 
-def check(resolved: Resolved, calibrations: Calibrations | None = None) -> list[str]:
-    """What would run, in lines for a person. Raises InputError, and InfeasiblePlan where a task says so itself.
+def check(resolved: Resolved, calibrations: Calibrations | None = None, feasible: bool = True) -> list[str]:
+    """What would run, in lines for a person. Raises InputError, and InfeasiblePlan for a task that has no plan.
 
-    ``calibrations`` are those that the run uses, by default what `experiments.calibrate.store.load` finds.
+    ``calibrations`` are those that the run uses, by default what `experiments.calibrate.store.load` finds. Without
+    ``feasible``, whether there is a plan is left to the plan stage, which leaves its answer in the run's folder.
     """
     calibrations = load(resolved) if calibrations is None else calibrations
     problems = _device_problems(resolved) + _scene_problems(resolved)
     if problems:
         raise InputError(problems)
-    made = tasks(resolved, believed(resolved, calibrations))
+    made = tasks(resolved, believed(resolved, calibrations), feasible)
+    plans = plan_files(resolved)
+    problems = [
+        problem
+        for eo in {*map(resting_eo, made.values()), *map(_resting_of_plan, plans.values())} - {None}
+        for problem in _scene_problems(resolved, eo)
+    ]
+    if problems:
+        raise InputError(problems)
     experiment, station = resolved.experiment, resolved.station
     held = resolved.grasped
     lines = [
@@ -40,11 +55,15 @@ def check(resolved: Resolved, calibrations: Calibrations | None = None) -> list[
         ),
         "friction " + ", ".join(f"{pair} {mu:g}" for pair, mu in resolved.friction.items()),
         "calibration " + (", ".join(str(file) for file in calibrations.files.values()) or "none: nominal figures"),
+        f"controllers learn {held.name}'s pose {_source_of_pose(resolved, calibrations)}",
     ]
     trials = 0
     for number, stage in enumerate(experiment.stages, 1):
         if isinstance(stage, PlanStage):
-            lines.append(f"stage {number}: plan {stage.name}: {stage.skill}, {len(made[stage.name].go)} steps")
+            how = f"{stage.optimiser['name']} on {stage.backend}, {stage.form} form"
+            count = made[stage.name].steps if stage.name in made else 0
+            steps = f", {count} step{'s' if count > 1 else ''}" if count else ""
+            lines.append(f"stage {number}: plan {stage.name}: {stage.skill}{steps}, {how}")
         elif isinstance(stage, ExecuteStage):
             trials += stage.trials * len(stage.controllers)
             count = f"{stage.trials} trial{'s' if stage.trials > 1 else ''} each"
@@ -56,20 +75,49 @@ def check(resolved: Resolved, calibrations: Calibrations | None = None) -> list[
     return lines
 
 
-def tasks(resolved: Resolved, known: Believed) -> dict[str, Task]:
-    """The planning task of each plan stage by name.
+def _source_of_pose(resolved: Resolved, calibrations: Calibrations) -> str:
+    """Where controllers learn the grasped object's pose from, in words, and why."""
+    asked, found = resolved.experiment.trial.go_pose, go_pose(resolved, calibrations)
+    if asked != "auto":
+        return "from the fingers, as asked" if found == "tactile" else "from its tag, as asked"
+    if found == "tactile":
+        return "from the fingers: their elasticity with it is identified"
+    if not has_fingers(resolved):
+        return "from its tag: the station has no tactile fingers"
+    stages = [stage.stage for stage in resolved.experiment.stages]
+    if "calibrate_elasticity" in stages:
+        return f"from its tag, and from the fingers after stage {stages.index('calibrate_elasticity') + 1}"
+    return "from its tag: the fingers' elasticity with it is not identified"
 
-    Raises InputError at the parameter that the geometry does not allow.
+
+def tasks(resolved: Resolved, known: Believed, feasible: bool = True) -> dict[str, SkillTask]:
+    """The planning task of each plan stage by name; with ``feasible`` its forces exist.
+
+    Raises InputError at the parameter that the geometry does not allow, and, with ``feasible``, InfeasiblePlan;
+    without, the stages that the statics refuse are left out.
     """
-    made: dict[str, Task] = {}
+    from planning import planner
+
+    made: dict[str, SkillTask] = {}
     for i, stage in enumerate(resolved.experiment.stages):
         if not isinstance(stage, PlanStage):
             continue
         try:
-            made[stage.name] = task(resolved, stage, known)
+            asked = task(resolved, stage, known)
+            if feasible:
+                planner.check(asked)
+            made[stage.name] = asked
         except ValueError as e:
             raise InputError([_task_problem(resolved, i, stage, str(e))]) from None
+        except InfeasiblePlan:
+            if feasible:
+                raise
     return made
+
+
+def _resting_of_plan(plan: Plan) -> tuple[float, float, float] | None:
+    eo = resting(plan)
+    return None if eo is None else (float(eo[0]), float(eo[1]), float(eo[2]))
 
 
 def _task_problem(resolved: Resolved, i: int, stage: PlanStage, text: str) -> Problem:
@@ -78,7 +126,8 @@ def _task_problem(resolved: Resolved, i: int, stage: PlanStage, text: str) -> Pr
     path = ("stages", i, "parameters")
     if colon and parameter in stage.parameters:
         path, text = (*path, parameter), rest
-    expected = f"parameters that {stage.skill} can do with {resolved.grasped.name}"
+    moved = "" if resolved.extrinsic is None else f" and {resolved.extrinsic.name}"
+    expected = f"parameters that {stage.skill} can do with {resolved.grasped.name}{moved}"
     return resolved.experiment_document.problem(path, text, expected)
 
 
@@ -114,13 +163,16 @@ _SCENE_KEYS = {
 }
 
 
-def _scene_problems(resolved: Resolved) -> list[Problem]:
-    """What the simulated world would refuse when the run has already begun. Raises InputError for the profile."""
+def _scene_problems(resolved: Resolved, X_W_eo: tuple[float, float, float] | None = None) -> list[Problem]:
+    """What the simulated world would refuse when the run has already begun. Raises InputError for the profile.
+
+    With the extrinsic object at ``X_W_eo``, or with an empty table.
+    """
     world = resolved.station.world or WorldConfig()
     profile = load_profile(world.profile)
     limit = (profile.fingers.force_limit or inf, profile.fingers.torque_limit or inf)
     try:
-        begin = scene(resolved)
+        begin = scene(resolved, X_W_eo)
         refuse_impossible(begin, coupling_of(begin, world.stiffness_scale, profile.membrane, limit))
     except ValueError as e:
         key, _, text = str(e).partition(": ")

@@ -12,6 +12,7 @@ from typing import Annotated, Any, TypeVar
 import typer
 from rich.console import Console
 
+from experiments import kernels
 from experiments.exit_codes import ExitCode
 
 app = typer.Typer(
@@ -149,16 +150,32 @@ def report(
 
 @command("extrinsic bench sim --check")
 def bench(
-    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="Which benchmark: sim, estimation.")],
+    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="Which benchmark: sim, estimation, planning.")],
     runs: Annotated[int, typer.Option("--runs", min=1, help="Measurements per figure; the median counts.")] = 5,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write BENCHMARK.json into DIR.")] = None,
     check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
+    horizons: Annotated[
+        str | None, typer.Option("--horizons", metavar="K,...", help="Steps of the problems of `planning`.")
+    ] = None,
 ) -> None:
     """Measure speed and accuracy, figure beside target, in one run."""
     from experiments import bench as benchmarks
 
-    raise typer.Exit(benchmarks.main(name, runs, json_file, out, check_targets))
+    raise typer.Exit(benchmarks.main(name, runs, json_file, out, check_targets, _horizons(horizons)))
+
+
+def _horizons(text: str | None) -> tuple[int, ...] | None:
+    """Numbers of steps. Raises InputError for anything else."""
+    from mechanics.yaml_input import InputError, Problem
+
+    if text is None:
+        return None
+    words = text.split(",")
+    if not all(word.strip().isdecimal() and 1 <= int(word) <= 100_000 for word in words):
+        wrong, expected = f"{text!r} are no horizons", "whole numbers of steps, such as 40,200,1000"
+        raise InputError([Problem("bench", None, "--horizons", wrong, expected)])
+    return tuple(dict.fromkeys(int(word) for word in words))
 
 
 def _check_packages() -> str | None:
@@ -180,6 +197,7 @@ def main() -> None:
     problem = _check_packages()
     if problem:
         sys.exit(f"extrinsic: {problem}")
+    kernels.keep()
     app()
 
 

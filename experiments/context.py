@@ -75,7 +75,7 @@ class RunContext:
 
     def fingers(self) -> tuple[Finger, ...]:
         """The tactile fingers, where controllers are to feel; they are made ready at the first call."""
-        if self.settings.go_pose != "tactile":
+        if setup.go_pose(self.resolved, self.calibrations) != "tactile":
             return ()
         if self._fingers is None:
             from experiments.fingers import fingers

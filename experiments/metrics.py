@@ -7,12 +7,21 @@ radius of gyration ρ: the own object's for poses, the go's for wrenches (design
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
+from shapely import MultiPoint, Point
 
+from estimation.tool_identification import Agreement
 from mechanics import se2
+from mechanics.friction import Mode
+from mechanics.polygon import Polygon
 from mechanics.readings import Array
 from mechanics.records import PlanarState, WaypointRecord
+from planning.plan import Plan
+
+#: a planned contact farther from the go's outline than this is another body's [m]
+_ON_GO = 1e-4
 
 Figure = dict[str, float]
 
@@ -75,6 +84,50 @@ def _object_errors(pairs: list[tuple[PlanarState, PlanarState]], body: str) -> A
         if getattr(actual, body) is not None and getattr(planned, body) is not None
     ]
     return pose_errors(*zip(*seen, strict=True)) if seen else None
+
+
+def contact_of(waypoints: Sequence[WaypointRecord], plan: Plan, outline: Polygon) -> dict[str, Any] | None:
+    """How far the contact on the go was believed to be from where ``plan`` has it, over ``waypoints``.
+
+    ``mean_mm`` and ``max_mm`` are over the ``waypoints`` with one known place (None where there is none); between
+    several planned contacts of the go, as of a face that lies flat, the distance is zero. ``not_located`` counts
+    the waypoints where the plan has the go, of ``outline``, touched and the place was not known. None where nobody
+    looked for it.
+    """
+    distances: list[float] = []
+    unknown = 0
+    for waypoint in waypoints:
+        planned = _planned_on_go(plan, waypoint.step, outline)
+        if waypoint.contact is None or not len(planned):
+            continue
+        if waypoint.contact.point is None:
+            unknown += 1
+        else:
+            distances.append(float(MultiPoint(planned).convex_hull.distance(Point(waypoint.contact.point))) * 1e3)
+    if not distances and not unknown:
+        return None
+    return {
+        "mean_mm": float(np.mean(distances)) if distances else None,
+        "max_mm": max(distances, default=None),
+        "waypoints": len(distances),
+        "not_located": unknown,
+    }
+
+
+def _planned_on_go(plan: Plan, step: int, outline: Polygon) -> Array:
+    """The planned contacts (n, 2) of the go at a step, in its frame."""
+    points = se2.transform(se2.inverse(plan.go[step]), plan.contact_points[step])
+    touches = np.array([mode is not Mode.FREE for mode in plan.contact_modes[step]], bool)
+    return points[touches & (np.abs(outline.signed_distance(points)) < _ON_GO)]
+
+
+def witness_of(found: Sequence[Agreement]) -> dict[str, Any] | None:
+    """How far [N] the sensor under the table and the wrist were apart, over a trial; None where it said nothing."""
+    if not found:
+        return None
+    apart = [float(np.hypot(*one.difference)) for one in found]
+    disagreements = sum(not one.agrees for one in found)
+    return {"mean_N": float(np.mean(apart)), "max_N": max(apart), "disagreements": disagreements}
 
 
 def paper_summary(figures: dict[str, Figure], rho: float) -> dict[str, float]:

@@ -1,4 +1,5 @@
-"""What experiment files can name: every skill under `planning.skills` and every controller under `control`.
+"""What experiment files can name: every skill under `planning.skills`, optimiser under `planning.optimisers` and
+controller under `control`.
 
 One file each: putting a file there that registers its class is all it takes. They are imported on first use, so that
 `--help` stays fast.
@@ -18,6 +19,13 @@ def skills() -> Mapping[str, Any]:
     """Skill classes by name."""
     _import_all("planning.skills")
     return importlib.import_module("planning.skills.base").SKILLS
+
+
+@cache
+def optimisers() -> Mapping[str, Any]:
+    """Optimiser classes by name."""
+    _import_all("planning.optimisers")
+    return importlib.import_module("planning.optimisers.base").OPTIMISERS
 
 
 @cache

@@ -46,7 +46,7 @@ def run(resolved: Resolved, out: Path | None = None, console: Console | None = N
     """Run an experiment. Raises InputError before anything was started; every later end is in the outcome."""
     console = console or Console(stderr=True)
     calibrations = store.load(resolved)
-    check(resolved, calibrations)  # what a dry run can find is found before anything is written
+    check(resolved, calibrations, feasible=False)  # bad input is found before anything is written
     folder = RunFolder.create(resolved.experiment.name, out)
     write_atomic(folder.experiment, dump_resolved(resolved))
     results: dict[str, Any] = {

@@ -6,7 +6,6 @@ sensor, a station) is looked up in `experiments.files`.
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
@@ -14,8 +13,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field
 from control.settings import TrialSettings
 from experiments import registries
 from experiments.calibrate.schema import CalibrationStage, CalibrationUse, FrictionStage, Pair
+from experiments.planning.schema import PlanStage, Slug
 from mechanics.catalogue import ObjectModel, SensorModel
-from mechanics.yaml_input import Refusal, nearest, one_of, validated
+from mechanics.yaml_input import Refusal, nearest, one_of
 
 Vector2 = tuple[float, float]
 
@@ -33,7 +33,8 @@ SensorReference = Annotated[
     Annotated[Annotated[str, _NAME], Tag("name")] | Annotated[SensorModel, Tag("inline")],
     Discriminator(_named_or_inline),
 ]
-Slug = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=100)]
+#: how the name of a plan file ends
+PLAN_FILE = ".npz"
 
 
 class _Model(BaseModel):
@@ -53,47 +54,6 @@ class ReportConfig(_Model):
     playback_rate: float = Field(default=25.0, gt=0, le=200)
 
 
-class PlanStage(_Model):
-    """Make a plan with a skill. ``parameters`` are the skill's own, checked by its model, every default filled in.
-
-    ``backend`` solves the contact programs: cvxpylayers, or the exact projection onto the cones.
-    """
-
-    stage: Literal["plan"]
-    name: Slug
-    skill: str
-    backend: Literal["cvxpylayers", "projection"] = "cvxpylayers"
-    parameters: dict[str, Any] = Field(default_factory=dict)
-
-    @classmethod
-    def submodel(cls, key: str, data: dict[str, Any]) -> type[BaseModel] | None:
-        """The model of the skill's parameters, where the data names a skill."""
-        skill = data.get("skill")
-        if key != "parameters" or not isinstance(skill, str) or skill not in registries.skills():
-            return None
-        return registries.skills()[skill].Parameters
-
-    @model_validator(mode="before")
-    @classmethod
-    def _checked_by_the_skill(cls, data: Any) -> Any:
-        if not isinstance(data, dict) or not isinstance(data.get("skill"), str):
-            return data  # the fields' own errors say it better
-        known = registries.skills()
-        if data["skill"] not in known:
-            name = data["skill"]
-            raise Refusal(f"unknown skill {name!r}", one_of(known), nearest(name, known), at=("skill",))
-        parameters = data.get("parameters", {})
-        if not isinstance(parameters, dict):
-            return data
-        model = validated(known[data["skill"]].Parameters, parameters, at=("parameters",))
-        return {**data, "parameters": model.model_dump(mode="json")}
-
-    @cached_property
-    def skill_parameters(self) -> BaseModel:
-        """The parameters as the skill's own model."""
-        return validated(registries.skills()[self.skill].Parameters, self.parameters, at=("parameters",))
-
-
 def _known_controllers(names: tuple[str, ...]) -> tuple[str, ...]:
     known = registries.controllers()
     for i, name in enumerate(names):
@@ -105,12 +65,20 @@ def _known_controllers(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class ExecuteStage(_Model):
-    """Run ``trials`` trials of an earlier plan under each controller."""
+    """Run ``trials`` trials of a plan under each controller.
+
+    ``plan`` names an earlier plan stage, or a plan file (``….npz``) that a run has left under its ``plans/``.
+    """
 
     stage: Literal["execute"]
-    plan: str
+    plan: Annotated[str, _NAME]
     controllers: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_known_controllers)]
     trials: int = Field(default=1, ge=1, le=10_000)
+
+    @property
+    def from_file(self) -> bool:
+        """Whether ``plan`` is a file."""
+        return self.plan.endswith(PLAN_FILE)
 
 
 Stage = Annotated[PlanStage | ExecuteStage | CalibrationStage, Field(discriminator="stage")]
@@ -142,10 +110,18 @@ class Experiment(_Model):
                 if stage.name in plans:
                     raise Refusal(f"a second plan named {stage.name!r}", "a name of its own", at=("stages", i, "name"))
                 plans.append(stage.name)
-            elif isinstance(stage, ExecuteStage) and stage.plan not in plans:
-                expected = one_of(plans) if plans else "a plan stage before this one"
+            elif isinstance(stage, ExecuteStage) and stage.plan not in plans and not stage.from_file:
+                expected = one_of([*plans, "a plan file (.npz)"]) if plans else "a plan stage before it, or a plan file"
                 wrong = f"no plan named {stage.plan!r} comes before this stage"
                 raise Refusal(wrong, expected, nearest(stage.plan, plans), at=("stages", i, "plan"))
+        return self
+
+    @model_validator(mode="after")
+    def _skills_find_what_they_move(self) -> Experiment:
+        for stage in self.stages:
+            if isinstance(stage, PlanStage) and stage.moves_extrinsic and self.extrinsic_object is None:
+                wrong = f"missing key: {stage.skill} moves an extrinsic object"
+                raise Refusal(wrong, "the name of an object, or a mapping", at=("extrinsic_object",))
         return self
 
     @model_validator(mode="after")

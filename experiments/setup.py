@@ -1,34 +1,41 @@
-"""From a resolved experiment to what the layers below work with: the scene, the tags, the weight, a skill's task."""
+"""From a resolved experiment to what the layers below work with: the scene, the tags, the weight, the observer."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from control.observe import Finger, Observer
 from control.settings import TrialSettings
+from control.witness import TableWitness
+from drivers.config import ForceTorqueConfig
+from drivers.errors import DriverError
 from drivers.scene import Body, Scene, TagMount
 from drivers.station import Devices
+from estimation.contact_filter import ContactFilter
 from estimation.contact_location import ContactLocator
+from estimation.contact_tracking import ContactTracker
+from estimation.contact_wrench import EnvironmentWrench
 from estimation.force_torque import FreeAirLoad, WristSensor
 from estimation.grasp_filter import GraspFilter
 from estimation.state import StateEstimator
-from experiments import registries
 from experiments.calibrate.models import CameraCalibration, ClockCalibration, ForceTorqueCalibration
 from experiments.calibrate.store import Calibrations
 from experiments.files import Resolved
-from experiments.schema import ExecuteStage, PlanStage
 from mechanics import se2
 from mechanics.camera import CameraModel, TagGeometry
 from mechanics.elasticity import Elasticity
 from mechanics.readings import Array
-from planning.skills.base import Held
-from planning.task import Task
 
 GRAVITY = 9.81
 #: height of the grasped object above the table before the first trial [m]
 START_HEIGHT = 0.03
+#: the contact is looked for with so much more friction than believed: a µ too small costs millimetres, one too large
+#: next to nothing
+MU_ROUNDED_UP = 1.1
 
 
 def free_air_load(resolved: Resolved) -> FreeAirLoad:
@@ -49,12 +56,17 @@ def _geometry(mount: TagMount) -> TagGeometry:
     return TagGeometry(mount.id, mount.size, mount.pose, mount.height)
 
 
-def scene(resolved: Resolved) -> Scene:
-    """The initial scene. An experiment that only calibrates begins with nothing on the table."""
+def scene(resolved: Resolved, X_W_eo: tuple[float, float, float] | None = None) -> Scene:
+    """The grasped object in the fingers, and the extrinsic one at ``X_W_eo``; without that the table is empty.
+
+    A run begins with an empty table; what a trial needs there is put there before it.
+    """
     whole = every_body(resolved)
-    if any(isinstance(stage, PlanStage | ExecuteStage) for stage in resolved.experiment.stages):
-        return whole
-    return without_extrinsic(whole)
+    if X_W_eo is None or whole.extrinsic is None:
+        return without_extrinsic(whole)
+    top = float(se2.transform(np.array(X_W_eo), np.array(whole.extrinsic.vertices))[:, 1].max())
+    x, y, theta = whole.start
+    return whole.model_copy(update={"extrinsic_pose": X_W_eo, "start": (x, y + top, theta)})
 
 
 def without_extrinsic(scene: Scene) -> Scene:
@@ -123,10 +135,67 @@ def believed(resolved: Resolved, calibrations: Calibrations) -> Believed:
     )
 
 
+def go_pose(resolved: Resolved, calibrations: Calibrations) -> Literal["tags", "tactile"]:
+    """Where a run that knows these calibrations lets its controllers learn the go's pose from (``trial.go_pose``)."""
+    asked = resolved.experiment.trial.go_pose
+    if asked != "auto":
+        return asked
+    return "tactile" if has_fingers(resolved) and calibrations.elasticity(resolved) is not None else "tags"
+
+
+def has_fingers(resolved: Resolved) -> bool:
+    """Whether the station has tactile fingers."""
+    return any(device.kind == "tactile" for device in resolved.station.devices.values())
+
+
+def contact_tracker(resolved: Resolved, known: Believed) -> ContactTracker:
+    """What follows the contact of a fresh grasp: the go's outline among ground and extrinsic object, friction as known.
+
+    The same seed gives the same answers.
+    """
+    mu = {pair: MU_ROUNDED_UP * value for pair, value in known.friction.items()}
+    on_go = max(value for pair, value in mu.items() if "go" in pair.split("-"))
+    locator = ContactLocator(resolved.grasped.polygon, on_go, only_near=True)
+    particles = ContactFilter(locator, np.random.default_rng(resolved.experiment.seed))
+    return ContactTracker(particles, mu, None if resolved.extrinsic is None else resolved.extrinsic.polygon)
+
+
+def warm_up(resolved: Resolved, known: Believed, fingers: tuple[Finger, ...] = ()) -> None:
+    """Estimate once what trials estimate: the first time on a machine compiles for seconds, and no arm may wait then.
+
+    A finger that fails is left for the trial to name.
+    """
+    wrench = EnvironmentWrench.of([0.0, 10.0, 0.0], np.diag([0.1, 0.1, 0.01]), np.zeros(2))
+    go = np.array([0.0, resolved.grasped.polygon.bounding_radius, 0.0])
+    contact_tracker(resolved, known).at(0, go, np.zeros((3, 3)), None, wrench)
+    prior = GraspFilter(resolved.grasp).predicted(0, np.zeros(3))
+    for finger in fingers:
+        with suppress(DriverError):
+            finger.method.estimate(finger.sensor.capture(), prior)
+
+
+def _witness(resolved: Resolved, devices: Devices, settings: TrialSettings) -> TableWitness | None:
+    """The sensor under the table, where the station has one."""
+    mounts = [d.mount for d in resolved.station.devices.values() if isinstance(d, ForceTorqueConfig)]
+    if mounts.count("table") != 1:
+        return None
+    sensor, eo = devices.force_torque("table"), resolved.extrinsic
+    return TableWitness(
+        sensor,
+        np.array(sensor.describe().extra["pose"], float),
+        resolved.grasped.mass * GRAVITY,
+        0.0 if eo is None else eo.mass * GRAVITY,
+        round(settings.window * 1e9),
+    )
+
+
 def observer(
     resolved: Resolved, devices: Devices, settings: TrialSettings, known: Believed, fingers: tuple[Finger, ...] = ()
 ) -> Observer:
-    """The eyes of a trial: arm, wrist sensor, camera and ``fingers``, with what is known of them and a fresh grasp."""
+    """The eyes of a trial: arm, wrist sensor, camera and ``fingers``, with what is known of them and a fresh grasp.
+
+    Without ``fingers`` the state takes the go's pose from its tag.
+    """
     wrist = devices.force_torque("wrist")
     said = wrist.describe().extra
     tool = said.get("tool", {"mass": 0.0, "centre": (0.0, 0.0)})
@@ -151,20 +220,8 @@ def observer(
             free_air_load(resolved),
             settings.window,
             delays=known.delays,
-            locator=ContactLocator(resolved.grasped.polygon, max(known.friction.values())),
+            contact=contact_tracker(resolved, known),
         ),
         tactile_frames=settings.tactile_frames,
+        witness=_witness(resolved, devices, settings),
     )
-
-
-def task(resolved: Resolved, stage: PlanStage, known: Believed) -> Task:
-    """What the planner is asked for. Raises ValueError naming the parameter that the geometry does not allow."""
-    held = Held(
-        vertices=resolved.grasped.polygon.vertices,
-        mass=resolved.grasped.mass,
-        grasp=resolved.grasp,
-        stiffness=known.stiffness,
-        mu=known.friction["go-ground"],
-        gravity=GRAVITY,
-    )
-    return registries.skills()[stage.skill].task(stage.skill_parameters, held)

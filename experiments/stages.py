@@ -10,37 +10,21 @@ from importlib import import_module
 from typing import Any
 
 from control.base import Controller
+from control.observe import Finger
 from control.trial import Trial, TrialResult, Watch
-from drivers.errors import DriverError, SimulationDiverged
+from drivers.errors import DeviceTimeout, DriverError, SimulationDiverged
 from drivers.station import Devices
 from experiments import registries, setup
+from experiments.arrange import arrange, hold
 from experiments.context import RunContext
-from experiments.metrics import errors_of
-from experiments.schema import ExecuteStage, PlanStage, Stage
+from experiments.metrics import contact_of, errors_of, witness_of
+from experiments.planning.stage import plan_stage, take_plan_files
+from experiments.schema import ExecuteStage, Stage
 from mechanics.records import PhaseRecord, PlanarState, TrialRecord, WaypointRecord
 from planning.plan import Plan
 
-
-def plan_stage(context: RunContext, stage: PlanStage) -> None:
-    """Make the plan that later stages execute. Raises InfeasiblePlan."""
-    from planning.planner import plan
-
-    begin = time.perf_counter()
-    with context.progress.step(f"plan {stage.name}"):
-        made = plan(setup.task(context.resolved, stage, context.believed), stage.name, backend=stage.backend)
-    context.plans[stage.name] = made
-    context.results["plans"].append(
-        {
-            "name": made.name,
-            "skill": made.skill,
-            "planner": made.planner,
-            "steps": len(made.ee),
-            "queries": made.queries,
-            "time_s": time.perf_counter() - begin,
-            "loss": made.loss,
-            "status": made.status,
-        }
-    )
+#: how long fingers that do not answer yet are asked for their untouched pictures before the first trial [s]
+PATIENCE = 30.0
 
 
 def execute_stage(context: RunContext, stage: ExecuteStage) -> None:
@@ -48,14 +32,33 @@ def execute_stage(context: RunContext, stage: ExecuteStage) -> None:
 
     A device that fails does: what cannot be commanded any more is not tried again.
     """
+    if stage.from_file:
+        take_plan_files(context)
     plan = context.plans[stage.plan]
     devices = context.devices()
+    _warm_up(context, stage)
     with devices.arm.lease(context.holder), context.timed(devices):
         for trial in range(stage.trials):
             for name in stage.controllers:
                 result = _one_trial(context, devices, plan, registries.controllers()[name], trial)
                 if result.status in ("device_failed", "stopped", "diverged"):
                     return
+
+
+def _warm_up(context: RunContext, stage: ExecuteStage) -> None:
+    """Have everything compiled that a trial estimates with, the simulated fingers' renderer included."""
+    fingers: tuple[Finger, ...] = ()
+    if any(registries.controllers()[name].feedback for name in stage.controllers):
+        patience = time.monotonic() + PATIENCE
+        while time.monotonic() < patience:
+            try:
+                fingers = context.fingers()
+                break
+            except DeviceTimeout:
+                continue
+            except DriverError:  # the trial will meet it again, and name it
+                break
+    setup.warm_up(context.resolved, context.believed, fingers)
 
 
 def _one_trial(
@@ -73,24 +76,31 @@ def _one_trial(
             context.write(witnessed)
             advance()
 
+        def on_phase(phase: str, fraction: float) -> None:
+            context.write(PhaseRecord(devices.clock.now_ns(), name, phase))
+            if fraction == 0.0:
+                hold(devices, plan, phase)
+
         watch = Watch(
             waypoint=on_waypoint,
             tick=context.check_interrupt,
-            phase=lambda phase, _fraction: context.write(PhaseRecord(devices.clock.now_ns(), name, phase)),
+            phase=on_phase,
             event=lambda level, text: context.event(level, f"{name}: {text}"),
             reset_scene=context.ask if devices.simulation is None else lambda _what: False,
         )
         clock, load = devices.clock, setup.free_air_load(context.resolved)
+        # without a pose in the plan the extrinsic object is not on the table
+        there = context.resolved if plan.eo is not None else replace(context.resolved, extrinsic=None)
         try:
-            if devices.simulation is not None:
-                devices.simulation.regrasp(trial)
-            observer = setup.observer(context.resolved, devices, context.settings, context.believed, context.fingers())
+            fingers = context.fingers() if controller.feedback else ()  # nobody else asks where the go is
+            observer = setup.observer(there, devices, context.settings, context.believed, fingers)
+            arrange(context, devices, observer, plan, trial)
             result = Trial(name, plan, controller, observer, clock, load, context.settings, watch).run()
         except SimulationDiverged as error:
             result = TrialResult("diverged", str(error), plan)
         except DriverError as error:  # before the protocol began
             result = TrialResult("device_failed", str(error), plan)
-    context.results["trials"].append(_row(context, name, controller.name, trial, result, waypoints))
+    context.results["trials"].append(_row(context, name, controller, trial, result, waypoints))
     end = replace(begin, status=result.status, reason=result.reason, plan=json.dumps(result.plan.to_dict()))
     context.write(replace(end, capture_ns=context.now_ns()))
     context.save()
@@ -105,16 +115,22 @@ def _truth(devices: Devices) -> PlanarState | None:
 
 
 def _row(
-    context: RunContext, name: str, controller: str, trial: int, result: TrialResult, waypoints: list[WaypointRecord]
+    context: RunContext,
+    name: str,
+    controller: type[Controller],
+    trial: int,
+    result: TrialResult,
+    waypoints: list[WaypointRecord],
 ) -> dict[str, Any]:
-    grasped, extrinsic = context.resolved.grasped, context.resolved.extrinsic
+    grasped, extrinsic = context.resolved.grasped, context.resolved.extrinsic if result.plan.eo is not None else None
     rho_go = grasped.polygon.radius_of_gyration
     rho_eo = None if extrinsic is None else extrinsic.polygon.radius_of_gyration
     return {
         "name": name,
         "skill": result.plan.skill,
         "planner": result.plan.planner,
-        "controller": controller,
+        "controller": controller.name,
+        "go_pose": setup.go_pose(context.resolved, context.calibrations) if controller.feedback else None,
         "grasped_object": grasped.name,
         "extrinsic_object": None if extrinsic is None else extrinsic.name,
         "sensor": context.resolved.sensor.name,
@@ -122,6 +138,8 @@ def _row(
         "status": result.status,
         "reason": result.reason,
         **{witness: errors_of(waypoints, witness, rho_go, rho_eo, rho_go) for witness in ("measured", "truth")},
+        "contact": contact_of(waypoints, result.plan, grasped.polygon),
+        "witness": witness_of(result.witness),
     }
 
 

@@ -13,7 +13,8 @@ from rich.table import Table
 from drivers.status import DeviceStatus
 from experiments.paper import beside
 
-FIGURES = ("go_pose_mm", "wrench_N")
+#: columns: figure and heading; the extrinsic object's only where there is one
+COLUMNS = {"go_pose_mm": "pose [mm]", "eo_pose_mm": "eo pose [mm]", "wrench_N": "wrench [N]"}
 
 
 def error_table(results: dict[str, Any]) -> Table:
@@ -23,13 +24,15 @@ def error_table(results: dict[str, Any]) -> Table:
     table.add_column("trial", overflow="fold")
     table.add_column("status")
     table.add_column("seen by")
-    table.add_column(escape("pose [mm]"), justify="right", no_wrap=True)
-    table.add_column(escape("wrench [N]"), justify="right", no_wrap=True)
+    moved = any(trial.get("extrinsic_object") for trial in results["trials"])
+    figures = [key for key in COLUMNS if moved or key != "eo_pose_mm"]
+    for key in figures:
+        table.add_column(escape(COLUMNS[key]), justify="right", no_wrap=True)
     groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for trial in results["trials"]:
         groups.setdefault((trial["skill"], trial["controller"]), []).append(trial)
         style = None if trial["status"] == "completed" else "yellow"
-        _rows(table, escape(trial["name"]), trial["status"], [trial], style)
+        _rows(table, escape(trial["name"]), trial["status"], [trial], style, figures)
     if not results["trials"]:
         table.add_row("no trial was run", results["status"])
     paper = beside(results["trials"])["rows"]
@@ -40,20 +43,22 @@ def error_table(results: dict[str, Any]) -> Table:
         table.add_section()
         if len(group) > 1:
             completed = sum(trial["status"] == "completed" for trial in group)
-            _rows(table, f"{skill}, {controller}", f"{completed} of {len(group)}", group, "bold")
+            _rows(table, f"{skill}, {controller}", f"{completed} of {len(group)}", group, "bold", figures)
         if printed is not None:
             name = controller if len(group) == 1 else ""
-            table.add_row(name, "", "paper", *(_cell(printed[key]) for key in FIGURES), style="dim")
+            table.add_row(name, "", "paper", *(_cell(printed.get(key)) for key in figures), style="dim")
     return table
 
 
-def _rows(table: Table, name: str, status: str, trials: list[dict[str, Any]], style: str | None) -> None:
+def _rows(
+    table: Table, name: str, status: str, trials: list[dict[str, Any]], style: str | None, keys: Sequence[str]
+) -> None:
     """A row for each witness: one trial's figures, or mean and spread over the trials' means."""
     for witness in ("measured", "truth"):
         seen = [trial[witness] for trial in trials if trial[witness] is not None]
         if not seen and witness == "truth":
             continue
-        cells = [_cell(_over([figures.get(key) for figures in seen])) for key in FIGURES]
+        cells = [_cell(_over([figures.get(key) for figures in seen])) for key in keys]
         table.add_row(name, status, witness, *cells, style=style)
         name = status = ""
 

@@ -13,8 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.optimize import linprog, minimize_scalar
 
 from mechanics.friction import required_friction
 from mechanics.readings import Array
@@ -142,7 +140,7 @@ def margins(
     if given.eo_jacobian is None:
         raise ValueError("margins: program: expected one with an extrinsic object's balance (P1)")
     if forces is None:
-        solution = BACKENDS["torch"]()(given)
+        solution = BACKENDS["fused"]()(given)
         if not solution.usable.all():
             check(given)
             k = int(np.argmin(solution.usable))
@@ -188,7 +186,7 @@ def _lacks(
     """
     assert program.eo_jacobian is not None and program.eo_load is not None
     (K, C), scale = program.modes.shape, force_scale(program)
-    blocks, equal, at_most, targets, bounds, cost = ([] for _ in range(6))
+    equal, at_most, targets, bounds, cost = ([] for _ in range(5))
     divisor = np.array([1.0, 1.0, program.length])
     n = 2 * C
     for k in range(K):
@@ -219,23 +217,39 @@ def _lacks(
         at_most.append(np.array(less).reshape(-1, n + 6 + C))
         bounds += limits + [(0.0, None)] * (6 + C)
         cost.append(np.concatenate([np.zeros(n), np.ones(6), np.full(C, pull or 0.0)]))
-        blocks.append(n + 6 + C)
-    found = linprog(
-        np.concatenate(cost),
-        A_ub=sparse.block_diag(at_most, format="csr") if sum(map(len, at_most)) else None,
-        b_ub=np.zeros(sum(map(len, at_most))) if sum(map(len, at_most)) else None,
-        A_eq=sparse.block_diag(equal, format="csr"),
-        b_eq=np.concatenate(targets),
-        bounds=bounds,
-        method="highs",
-    )
-    if found.x is None:  # what is held contradicts a mode
+    x = _linear_program(cost, at_most, [np.zeros(len(rows)) for rows in at_most], equal, targets, bounds)
+    if x is None:  # what is held contradicts a mode
         if K == 1:
             return np.array([np.inf]), np.zeros((1, C, 2))
         parts = [_lacks(take(program, [k]), mu[k : k + 1], hard, held, pull) for k in range(K)]
         return np.concatenate([p[0] for p in parts]), np.concatenate([p[1] for p in parts])
-    x = found.x.reshape(K, -1)
+    x = x.reshape(K, -1)
     return x[:, n : n + 6].sum(axis=1), x[:, :n].reshape(K, C, 2) * scale[:, None, None]
+
+
+def _linear_program(
+    cost: list[Array],
+    at_most: list[Array],
+    limits: Sequence[Array],
+    equal: list[Array],
+    targets: list[Array],
+    bounds: list[tuple[float | None, float | None]],
+) -> NDArray[np.float64] | None:
+    """Return the x of all steps at which Σ costᵀ x is least; None where nothing meets ``at_most`` x ≤ ``limits``,
+    ``equal`` x = ``targets`` of each step, and the ``bounds``."""
+    from scipy import sparse
+    from scipy.optimize import linprog
+
+    limited = any(map(len, at_most))
+    return linprog(
+        np.concatenate(cost),
+        A_ub=sparse.block_diag(at_most, format="csr") if limited else None,
+        b_ub=np.concatenate(limits) if limited else None,
+        A_eq=sparse.block_diag(equal, format="csr"),
+        b_eq=np.concatenate(targets),
+        bounds=bounds,
+        method="highs",
+    ).x
 
 
 def _least(lacks: Callable[[float], float], has: float, slips: bool) -> float | None:
@@ -256,6 +270,8 @@ def _least(lacks: Callable[[float], float], has: float, slips: bool) -> float | 
         else:
             i = int(np.argmin(amounts))
             around = float(grid[max(i - 1, 0)]), float(grid[min(i + 1, len(grid) - 1)])
+            from scipy.optimize import minimize_scalar
+
             nearest = minimize_scalar(lacks, bounds=around, method="bounded", options={"xatol": 1e-9})
             return float(nearest.x) if nearest.fun <= 10 * BALANCED else None
     if high is None:
@@ -377,15 +393,7 @@ def _answer(program: ContactProgram, wished: Array, ours: Array) -> Array:
         limits.append(right)
         bounds += [(None, None)] * n + [(0.0, None)] * n + [(None, 10.0)]
         cost.append(np.concatenate([np.zeros(n), np.full(n, 1e4), [-1.0]]))
-    found = linprog(
-        np.concatenate(cost),
-        A_ub=sparse.block_diag(at_most, format="csr"),
-        b_ub=np.concatenate(limits),
-        A_eq=sparse.block_diag(equal, format="csr"),
-        b_eq=np.concatenate(targets),
-        bounds=bounds,
-        method="highs",
-    )
-    if found.x is None:
+    x = _linear_program(cost, at_most, limits, equal, targets, bounds)
+    if x is None:
         raise InfeasiblePlan(0, program.names[0], np.nan, np.nan, reason="a disturbed force cannot be balanced")
-    return found.x.reshape(K, width)[:, :n].reshape(K, C, 2) * scale[:, None, None]
+    return x.reshape(K, width)[:, :n].reshape(K, C, 2) * scale[:, None, None]

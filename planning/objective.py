@@ -1,4 +1,4 @@
-"""The loss of a contact trajectory problem, through any backend: build the programs, solve, weigh.
+"""The loss of a contact trajectory problem and its derivatives by torch, through any backend that it differentiates.
 
 Per step: variables → poses by closure (`planning.closure`) → contact program (`planning.program`) → forces → sensor's
 wrench and end-effector → residuals (`planning.losses`). The loss is the sum of all squared residuals. `TorchObjective`
@@ -7,69 +7,21 @@ differentiates the whole by autograd, through the program's solution by the back
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mechanics.friction import Mode
 from mechanics.readings import Array
-from planning import losses, trajectory
+from planning import evaluation, trajectory
 from planning.errors import InfeasiblePlan
+from planning.evaluation import Evaluation, backend_of, check_finite, check_shape
 from planning.optimisers.base import Quadratic
 from planning.problem import MILLIMETRE, VARIABLES, Problem
-from planning.program import BACKENDS, Backend, ContactProgram, Solution
-from planning.trajectory import Posed, program
-
-__all__ = ["Evaluation", "OutsideBarrier", "TorchObjective", "backend_of", "evaluate", "program"]
-
-
-@dataclass(frozen=True, eq=False)
-class Evaluation:
-    """A solved trajectory of K steps and C contacts, in numpy: the object contacts first, then those with the ground.
-
-    Poses (K, 3) X_W_go, X_W_ee, X_W_eo; ``wrench`` (K, 3) of the sensor on the go about the grasp centre, axes of W;
-    ``points`` and ``normals`` (K, C, 2) in W, ``forces`` (K, C, 2), ``modes`` K × C and ``mu`` (C,), signs as in
-    `mechanics.friction`. ``terms`` is each loss by name, ``value`` their sum, +inf outside a barrier or where a program
-    has no solution: ``solution.status`` says which.
-    """
-
-    go: Array
-    ee: Array
-    eo: Array
-    wrench: Array
-    names: tuple[str, ...]
-    points: Array
-    normals: Array
-    forces: Array
-    modes: tuple[tuple[Mode, ...], ...]
-    mu: Array
-    terms: dict[str, float]
-    value: float
-    solution: Solution
-
-
-class OutsideBarrier(InfeasiblePlan):
-    """A step lies beyond what a barrier keeps it from, so the loss is infinite and has no gradient.
-
-    ``contact`` is the loss: ``penetration``, ``workspace``, ``joints`` or ``sensor``.
-    """
-
-    def __str__(self) -> str:
-        return f"{self.contact}, step {self.step}: {self.reason}"
-
-
-def backend_of(backend: str | Backend) -> Backend:
-    """Return a backend by name. Raises ValueError for an unknown one."""
-    if callable(backend):
-        return backend
-    if backend not in BACKENDS:
-        raise ValueError(f"objective: backend: expected one of {', '.join(sorted(BACKENDS))}, received {backend!r}")
-    return BACKENDS[backend]()
+from planning.program import Backend
+from planning.trajectory import Posed
 
 
 class TorchObjective:
@@ -89,7 +41,7 @@ class TorchObjective:
     def values(self, z: Array) -> Array:
         """Return the loss (B,) of ``z`` (B, K, 5): +inf outside a barrier or where a program has no solution."""
         z = np.asarray(z, dtype=np.float64)
-        _check(self.problem, z, batched=True)
+        check_shape(self.problem, z, batched=True)
         if len(z) == 0:
             return np.empty(0)
         finite = np.all(np.isfinite(np.where(self.free, z, 0.0)), axis=(1, 2))
@@ -106,7 +58,7 @@ class TorchObjective:
     def gradient(self, z: Array) -> tuple[float, Array]:
         """Return the loss and its gradient (K, 5) at ``z`` (K, 5)."""
         solved = self._solved(z)
-        if not isinstance(solved, _Solved):
+        if solved is None:
             return np.inf, np.zeros(self.free.shape)
         total = sum((r.square().sum() for r in solved.parts.values()), 0 * solved.at.sum())
         (gradient,) = torch.autograd.grad(total, solved.at)
@@ -121,7 +73,7 @@ class TorchObjective:
         K, solved = self.problem.steps, self._solved(z)
         gradient, diagonal = np.zeros((K, VARIABLES)), np.zeros((K, VARIABLES, VARIABLES))
         below = np.zeros((K - 1, VARIABLES, VARIABLES))
-        if not isinstance(solved, _Solved):
+        if solved is None:
             return Quadratic(np.inf, gradient, diagonal, below)
         value = 0.0
         for name, residual in solved.parts.items():
@@ -145,35 +97,28 @@ class TorchObjective:
 
     def evaluate(self, z: Array) -> Evaluation:
         """Return everything at ``z`` (K, 5)."""
-        return evaluate(self.problem, z, self._solve)
+        return evaluation.evaluate(self.problem, z, self._solve)
 
     def refusal(self, z: Array) -> InfeasiblePlan | None:
         """Return what makes the loss infinite at ``z`` (K, 5), naming step and constraint; None where it is finite."""
-        solved = self._solved(z)
-        return None if isinstance(solved, _Solved) else solved()
+        return evaluation.refusal(self.problem, z, self._solve)
 
-    def _solved(self, z: Array) -> _Solved | Callable[[], InfeasiblePlan]:
-        """The residuals at ``z``, or where one is infinite a function that says why: that takes linear programs."""
+    def _solved(self, z: Array) -> _Solved | None:
+        """The residuals at ``z``, None where one is infinite."""
         z = np.asarray(z, dtype=np.float64)
-        _check(self.problem, z)
+        check_shape(self.problem, z)
+        check_finite(self.problem, z)
         z = np.where(self.free, z, self.start)
-        if not np.isfinite(z).all():
-            k = int(np.argwhere(~np.isfinite(z))[0, 0])
-            raise ValueError(f"objective: z: step {k}: expected finite numbers, received {z[k].tolist()}")
         at = torch.from_numpy(z).requires_grad_()
         posed = trajectory.pose(self.problem, at)
-        asked = trajectory.posed_program(self.problem, posed)
-        solution = self._solve(asked)
+        solution = self._solve(trajectory.posed_program(self.problem, posed))
         if not solution.usable.all():
-            return partial(_without_solution, asked, solution)
+            return None
         if not isinstance(solution.forces, torch.Tensor):
             raise ValueError("objective: backend: expected one that torch differentiates, received forces in numpy")
         parts = trajectory.residuals(self.problem, posed, solution.forces)
-        for name, residual in parts.items():
-            infinite = np.argwhere(~np.isfinite(residual.detach().numpy()))
-            if len(infinite):
-                k, i = (int(n) for n in infinite[0])
-                return partial(_outside, self.problem, posed, solution.forces, name, k, i)
+        if not all(bool(torch.isfinite(residual).all()) for residual in parts.values()):
+            return None
         return _Solved(at, posed, parts)
 
     def _jacobian(self, of: torch.Tensor, at: torch.Tensor) -> Array:
@@ -195,83 +140,5 @@ class _Solved:
     parts: dict[str, torch.Tensor]
 
 
-def evaluate(problem: Problem, z: Array, backend: str | Backend = "torch") -> Evaluation:
-    """Return everything at ``z`` (K, 5), in numpy. Nothing is raised where a program has no solution."""
-    z = np.asarray(z, dtype=np.float64)
-    _check(problem, z)
-    z = np.where(problem.free, z, problem.start)
-    posed = trajectory.pose(problem, z)
-    solution = backend_of(backend)(trajectory.posed_program(problem, posed))
-    if isinstance(solution.forces, torch.Tensor):
-        found = {n: getattr(solution, n) for n in ("forces", "balance", "cone")}
-        solution = replace(solution, **{n: v.detach().numpy() for n, v in found.items() if isinstance(v, torch.Tensor)})
-    forces = np.asarray(solution.forces)
-    with torch.no_grad():
-        parts = trajectory.residuals(
-            problem, trajectory.pose(problem, torch.from_numpy(z)), torch.from_numpy(np.array(forces))
-        )
-        terms = {name: float(r.square().sum()) for name, r in parts.items()}
-    value = sum(terms.values()) if solution.usable.all() else np.inf
-    wrench, ee = trajectory.sensor(problem, posed, forces)
-    return Evaluation(
-        go=posed.placed.go,
-        ee=ee,
-        eo=np.array(problem.eo),
-        wrench=wrench,
-        names=trajectory.contact_names(problem),
-        points=posed.placed.points,
-        normals=posed.placed.normals,
-        forces=forces,
-        modes=tuple(zip(*(contact.modes for contact in (*problem.contacts, *problem.ground)), strict=True)),
-        mu=trajectory.contact_mu(problem),
-        terms=terms,
-        value=float(value) if not np.isnan(value) else np.inf,
-        solution=solution,
-    )
-
-
-def _check(problem: Problem, z: Array, batched: bool = False) -> None:
-    if z.ndim != 2 + batched or z.shape[-2:] != (problem.steps, VARIABLES):
-        expected = f"({'B, ' * batched}{problem.steps}, {VARIABLES})"
-        raise ValueError(f"objective: z: expected shape {expected}, received {z.shape}")
-
-
 def _tensor(value: Any) -> torch.Tensor:
     return value if isinstance(value, torch.Tensor) else torch.from_numpy(np.array(value, dtype=np.float64))
-
-
-def _outside(problem: Problem, posed: Posed, forces: torch.Tensor, name: str, k: int, i: int) -> OutsideBarrier:
-    """The residual ``i`` of the loss ``name`` that is infinite at step ``k``, in figures."""
-    wrench, ee = (value.detach().numpy()[k] for value in trajectory.sensor(problem, posed, forces))
-    limits = problem.limits
-    reason = "the loss is infinite"
-    if name == "penetration":
-        angle, (lo, hi) = np.degrees(posed.variables.angle[k].item()), np.degrees(problem.angle_limits[k])
-        reason = f"the relative angle is {angle:.4g}°, admissible are {lo:.4g}° to {hi:.4g}°"
-    elif name == "workspace" and limits.workspace is not None:
-        which, unit, factor = (("x", "mm", 1e3), ("y", "mm", 1e3), ("angle", "°", 180 / np.pi))[i]
-        lo, hi = limits.workspace[i] * factor
-        reason = f"the end-effector's {which} is {ee[i] * factor:.4g} {unit}, the workspace {lo:.4g} to {hi:.4g} {unit}"
-    elif name == "joints" and limits.arm is not None:
-        readings, reachable = losses.joint_readings(limits.arm, torch.from_numpy(ee))
-        joint, (lo, hi) = ("shoulder", "elbow", "wrist")[i], np.degrees(limits.arm.limits[i])
-        reason = f"the {joint} is at {np.degrees(float(readings[i])):.4g}°, its limits are {lo:.4g}° to {hi:.4g}°"
-        if not reachable:
-            reason = f"the arm does not reach ({ee[0] * 1e3:.4g}, {ee[1] * 1e3:.4g}) mm at {np.degrees(ee[2]):.4g}°"
-    elif name == "sensor" and i == 0 and limits.force is not None:
-        reason = f"the sensor takes {limits.force:.4g} N and is to carry {np.hypot(wrench[0], wrench[1]):.4g} N"
-    elif name == "sensor" and limits.torque is not None:
-        reason = f"the sensor takes {limits.torque * 1e3:.4g} N·mm and is to carry {abs(wrench[2]) * 1e3:.4g} N·mm"
-    return OutsideBarrier(k, name, np.nan, np.nan, reason=reason)
-
-
-def _without_solution(asked: ContactProgram, solution: Solution) -> InfeasiblePlan:
-    """The first step whose program has no solution, and why."""
-    from planning.feasibility import explain
-
-    k = int(np.argmin(solution.usable))
-    found = explain(asked, k, hard=False)
-    if found is not None:
-        return found.error()
-    reason = f"forces exist, but the solver found none ({solution.status[k]})"
-    return InfeasiblePlan(k, "', '".join(asked.names), np.nan, np.nan, reason=reason)

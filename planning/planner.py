@@ -13,13 +13,15 @@ from mechanics import se2
 from mechanics.elasticity import Elasticity
 from mechanics.friction import cone_margin, project_to_mode, required_friction
 from mechanics.readings import Array
-from planning import closure, feasibility
+from planning import closure, evaluation, feasibility
 from planning.errors import InfeasiblePlan
-from planning.objective import Evaluation, TorchObjective, program
+from planning.evaluation import Evaluation
+from planning.fused.objective import FusedObjective
 from planning.optimisers.base import Optimiser, Optimum
 from planning.plan import Plan
 from planning.problem import ANGLE, TRAVEL, Problem
 from planning.skills.base import SkillTask
+from planning.trajectory import program
 from planning.verification import verify
 
 RAMP_LEVELS = 11
@@ -50,7 +52,7 @@ def plan(
     name: str,
     *,
     optimiser: Optimiser | None = None,
-    objective: Callable[[Problem], Any] = TorchObjective,
+    objective: Callable[[Problem], Any] = FusedObjective,
     rng: np.random.Generator | None = None,
     levels: int = RAMP_LEVELS,
     provenance: dict[str, Any] | None = None,
@@ -135,7 +137,7 @@ def check(task: SkillTask) -> Margins:
     check_wish(problem)
     feasibility.check(program(problem, problem.start))
     margins = robustness(task)
-    refusal = TorchObjective(problem).refusal(problem.start)
+    refusal = evaluation.refusal(problem, problem.start)
     if refusal is not None:
         raise refusal
     return margins

@@ -1,6 +1,6 @@
 """From variables to residuals, around the backend: poses, contact programs, the sensor's wrench and the losses.
 
-Every function takes numpy or torch and any leading dimensions before the K steps, but for `residuals`, which is torch.
+Every function takes numpy or torch and any leading dimensions before the K steps.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
 from mechanics import se2
 from mechanics._shapes import Array, load
@@ -131,36 +130,35 @@ def sensor(problem: Problem, posed: Posed, forces: Array) -> tuple[Array, Array]
     return wrench, elasticity.ee_pose(go, problem.grasp, wrench)
 
 
-def residuals(problem: Problem, posed: Posed, forces: torch.Tensor) -> dict[str, torch.Tensor]:
+def residuals(problem: Problem, posed: Posed, forces: Array) -> dict[str, Array]:
     """Return each loss's residuals (..., K, r), or (..., K−1, 3), weighted so that their squares sum to the loss.
 
     ``forces`` (..., K, C, 2). A loss of weight 0, or with nothing to measure, is left out.
     """
     weights, limits, rho, K = problem.weights, problem.limits, problem.go_body.rho, problem.steps
     n, y, go = len(problem.contacts), posed.variables, posed.placed.go
-    of_object = forces[..., :n, :]
+    xp, of_object, code = load(
+        "residuals", forces=(forces[..., :n, :], (n, 2)), modes=(mode_codes(problem)[:, :n], (n,))
+    )
     wrench, ee = sensor(problem, posed, forces)
-    code = torch.from_numpy(mode_codes(problem)[:, :n])
 
-    def given(array: Array) -> torch.Tensor:
-        return torch.tensor(np.array(array), dtype=forces.dtype)
-
-    found: dict[str, torch.Tensor] = {}
+    found: dict[str, Array] = {}
     if problem.eo_body is not None:
-        found["cone"] = torch.where(code == STICK, losses.cone(of_object), 0.0)
-        found["pull"] = torch.where(code == FREE, 0.0, losses.pull(of_object))
-    wish = given(sum(contact.wish for contact in problem.contacts))
+        nothing = xp.zeros_like(of_object[..., 0])
+        found["cone"] = xp.where(code == STICK, losses.cone(of_object), nothing)
+        found["pull"] = xp.where(code == FREE, nothing, losses.pull(of_object))
+    wish = sum(contact.wish for contact in problem.contacts)
     found["force"] = losses.contact_force(of_object.sum(-2), wish)
     if weights.penetration:
-        found["penetration"] = losses.penetration(y.angle, given(problem.angle_limits))
+        found["penetration"] = losses.penetration(y.angle, problem.angle_limits)
     if posed.wrench is not None:
         lacks = wrench - closure.sensor_wrench(posed.weight, posed.go_jacobian, forces)
         found["slack"] = losses.slack(lacks, rho)
-    found["track"] = losses.track(y.angle, y.travel, given(problem.angle), given(problem.travel), rho)
+    found["track"] = losses.track(y.angle, y.travel, problem.angle, problem.travel, rho)
     if K > 1:
         found["smooth"] = losses.smooth(go, rho)
     if limits.workspace is not None:
-        found["workspace"] = losses.workspace(ee, given(limits.workspace))
+        found["workspace"] = losses.workspace(ee, limits.workspace)
     if limits.arm is not None:
         found["joints"] = losses.joints(ee, limits.arm)
     if limits.force is not None or limits.torque is not None:

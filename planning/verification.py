@@ -11,7 +11,7 @@ import numpy as np
 from mechanics import se2
 from mechanics.friction import Mode, cone_margin
 from mechanics.readings import Array
-from planning.objective import Evaluation
+from planning.evaluation import Evaluation
 from planning.problem import ANGLE, Form, Problem
 
 EXACT = 1e-6

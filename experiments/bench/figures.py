@@ -60,6 +60,7 @@ class Targets(BaseModel):
 
     sim: dict[str, Target]
     estimation: dict[str, Target]
+    planning: dict[str, Target]
 
 
 def targets_of(benchmark: str) -> dict[str, Target]:

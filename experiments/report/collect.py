@@ -195,8 +195,8 @@ def _waypoints(trial: _Trial, start_ns: int) -> dict[str, Any]:
     points = trial.waypoints
     simulated = any(point.truth is not None for point in points)
     contacts: list[list[dict[str, Any]]] = [[] for _ in points]
-    if trial.end is not None and trial.end.plan:
-        plan = Plan.from_dict(json.loads(trial.end.plan))
+    plan = _plan(trial)
+    if plan is not None:
         contacts = [_planned_contacts(plan, point.step) for point in points]
     return {
         "t": [(point.capture_ns - start_ns) * SECOND for point in points],
@@ -205,6 +205,16 @@ def _waypoints(trial: _Trial, start_ns: int) -> dict[str, Any]:
         "truth": _states(point.truth for point in points) if simulated else None,
         "contacts": contacts,
     }
+
+
+def _plan(trial: _Trial) -> Plan | None:
+    """The plan that a trial executed; None where it was torn off, or made by a version that wrote plans otherwise."""
+    if trial.end is None or not trial.end.plan:
+        return None
+    try:
+        return Plan.from_dict(json.loads(trial.end.plan))
+    except ValueError:
+        return None
 
 
 def _planned_contacts(plan: Plan, step: int) -> list[dict[str, Any]]:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from mechanics.readings import Array
+from planning import evaluation
+from planning.errors import InfeasiblePlan
+from planning.evaluation import Evaluation, check_finite, check_shape
 from planning.fused.pack import pack
 from planning.fused.trajectory import ADAM, run
 from planning.optimisers.base import Quadratic
 from planning.problem import VARIABLES, Problem
-
-if TYPE_CHECKING:
-    from planning.objective import Evaluation
 
 
 class FusedObjective:
@@ -72,21 +70,18 @@ class FusedObjective:
 
     def evaluate(self, z: Array) -> Evaluation:
         """Return everything at ``z`` (K, 5), with the programs solved by the same kernel."""
-        from planning.objective import evaluate
+        return evaluation.evaluate(self.problem, z, "fused")
 
-        return evaluate(self.problem, z, "fused")
+    def refusal(self, z: Array) -> InfeasiblePlan | None:
+        """Return what makes the loss infinite at ``z`` (K, 5), naming step and constraint; None where it is finite."""
+        return evaluation.refusal(self.problem, z, "fused")
 
     def _run(self, z: Array, values: Array, gradient: Array, diagonal: Array, below: Array, level: int, adam=None):
         run(z, *self._data, self._warm, values, gradient, diagonal, below, level, *(adam or self._adam))
 
     def _checked(self, z: Array, batched: bool = False) -> NDArray[np.float64]:
         z = np.require(z, np.float64, ["C", "W"])  # another layout would be compiled anew
-        K = self.problem.steps
-        if z.ndim != 2 + batched or z.shape[-2:] != (K, VARIABLES):
-            raise ValueError(f"objective: z: expected shape ({'B, ' * batched}{K}, {VARIABLES}), received {z.shape}")
+        check_shape(self.problem, z, batched)
         if not batched and not np.isfinite(z).all():
-            finite = np.isfinite(np.where(self.free, z, 0.0)).all(axis=1)
-            if not finite.all():
-                k = int(np.argmin(finite))
-                raise ValueError(f"objective: z: step {k}: expected finite numbers, received {z[k].tolist()}")
+            check_finite(self.problem, z)
         return z

@@ -17,9 +17,9 @@ from estimation.force_torque import FreeAirLoad, WristSensor
 from experiments import setup
 from experiments.calibrate.store import Calibrations
 from experiments.files import load
+from experiments.planning.make import make
 from mechanics.camera import CameraModel
 from mechanics.records import WaypointRecord
-from planning.planner import plan as make_plan
 
 STEPS = 3
 
@@ -38,7 +38,7 @@ class Station:
         self.arm = self.devices["arm"]
         self.arm.acquire("test")
         stage: Any = self.resolved.experiment.stages[0]
-        self.plan = make_plan(setup.task(self.resolved, stage, setup.believed(self.resolved, Calibrations())), "press")
+        self.plan = make(self.resolved, stage, setup.believed(self.resolved, Calibrations()))
         self.events: list[tuple[str, str]] = []
         self.phases: list[str] = []
         self.waypoints: list[WaypointRecord] = []

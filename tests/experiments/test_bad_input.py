@@ -333,11 +333,6 @@ SCENES = {
         "mine.yaml, line 3: friction.go-ground: the number 0",
         "greater than 0",
     ),
-    "extrinsic object that stands nowhere": (
-        ("mine.yaml", "station: sim", "station: sim\nextrinsic_object: hbox"),
-        "mine.yaml, line 3: extrinsic_object: missing",
-        "a pose in the world",
-    ),
 }
 
 

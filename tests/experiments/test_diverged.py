@@ -31,7 +31,7 @@ def resolved():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    short = ["stages.0.parameters.steps=2", "stages.0.backend=projection", "stages.1.controllers=[open_loop]"]
+    short = ["stages.0.parameters.steps=2", "stages.1.controllers=[open_loop]"]
     return load("grasped_static", None, ["world.profile=ideal", f"bus.endpoint=tcp/127.0.0.1:{port}", *short])
 
 

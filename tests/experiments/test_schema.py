@@ -12,13 +12,23 @@ from drivers.scene import Body
 from experiments.calibrate.store import Calibrations
 from experiments.check import check, tasks
 from experiments.files import PACKAGE, Resolved, dump_resolved, load, load_station
-from experiments.schema import ExecuteStage, PlanStage
+from experiments.planning.schema import PlanStage
+from experiments.schema import ExecuteStage
 from experiments.setup import believed
 from mechanics import model_paths
 from mechanics.camera import CameraModel
 from mechanics.yaml_input import InputError
 
-SHIPPED = ["grasped_static", "grasped_pivoting"]
+SHIPPED = [
+    "grasped_static",
+    "grasped_pivoting",
+    "grasped_sliding",
+    "static_in_contact",
+    "relative_pivoting",
+    "relative_sliding",
+    "extrinsic_pushing",
+    "extrinsic_pivoting",
+]
 
 TWO_OBJECTS = """
 name: pair
@@ -63,8 +73,8 @@ def test_a_bare_name_and_the_path_in_the_repository_mean_the_same(name):
 def test_grasped_pivoting_asks_for_the_motion_of_the_notes():
     resolved = load("grasped_pivoting")
     task = tasks(resolved, believed(resolved, Calibrations()))["pivot"]
-    np.testing.assert_allclose(np.degrees(task.go[[0, -1], 2]), [10, 35])
-    assert len(task.go) == 20
+    np.testing.assert_allclose(np.degrees(task.problem.angle[[0, -1]]), [10, 35])
+    assert task.steps == 20
 
 
 def test_figures_are_si_and_in_the_objects_frame():
@@ -239,7 +249,7 @@ def test_plans_come_before_their_execution_and_have_names_of_their_own(elsewhere
         "- {stage: execute, plan: b, controllers: [open_loop]}\n- {stage: plan, name: b, skill: grasped_static}\n"
     )
     found = refused("x.yaml")
-    assert (found.line, found.key, found.expected) == (5, "stages.1.plan", "a")
+    assert (found.line, found.key, found.expected) == (5, "stages.1.plan", "one of a, a plan file (.npz)")
     found = refused("x.yaml", "stages.1.plan=a", "stages.2.name=a")
     assert (found.file, found.key) == ("--set stages.2.name", "stages.2.name")
 

@@ -50,5 +50,13 @@ def test_several_trials_end_with_the_mean_of_their_means_and_its_spread():
     assert "2.000 ± 1.000" in text
 
 
+def test_an_extrinsic_object_has_a_column_where_there_is_one():
+    assert "eo pose" not in shown([trial("open_loop")])
+    row = trial("open_loop", skill="extrinsic_pushing") | {"extrinsic_object": "hbox"}
+    figures = {key: {"mean": 2.0, "std": 0.1} for key in ("go_pose_mm", "wrench_N")}
+    text = shown([row | {"measured": figures | {"eo_pose_mm": {"mean": 0.125, "std": 0.25}}, "truth": None}])
+    assert "eo pose [mm]" in text and "0.125 ± 0.250" in text and "2.000 ± 0.100" in text
+
+
 def test_a_run_without_trials_says_so():
     assert "no trial was run" in shown([])

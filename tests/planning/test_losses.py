@@ -14,8 +14,14 @@ def tensor(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-def test_the_cone_loss_is_one_minus_the_cosine_with_the_normal():
-    force = tensor([[3.0, 4.0], [2.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
+@pytest.fixture(params=[np.array, tensor], ids=["numpy", "torch"])
+def array(request):
+    """What makes the arrays that a loss is given."""
+    return request.param
+
+
+def test_the_cone_loss_is_one_minus_the_cosine_with_the_normal(array):
+    force = array([[3.0, 4.0], [2.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, 0.0]])
     np.testing.assert_allclose(losses.cone(force), [1 - 3 / 5, 0.0, 1.0, 2.0, 1.0], atol=1e-15)
 
 
@@ -26,45 +32,45 @@ def test_the_cone_loss_has_a_gradient_where_there_is_no_force():
     assert force.grad.tolist() == [-1 / losses.NO_FORCE, 0.0]
 
 
-def test_only_what_pulls_is_charged_for_pulling():
-    np.testing.assert_array_equal(losses.pull(tensor([[3.0, 9.0], [-2.0, 9.0], [0.0, 1.0]])), [0.0, -2.0, 0.0])
+def test_only_what_pulls_is_charged_for_pulling(array):
+    np.testing.assert_array_equal(losses.pull(array([[3.0, 9.0], [-2.0, 9.0], [0.0, 1.0]])), [0.0, -2.0, 0.0])
 
 
-def test_the_force_loss_is_what_misses_the_wish():
-    np.testing.assert_array_equal(losses.contact_force(tensor([[3.0, 1.0]]), tensor([[2.5, 2.0]])), [[0.5, -1.0]])
+def test_the_force_loss_is_what_misses_the_wish(array):
+    np.testing.assert_array_equal(losses.contact_force(array([[3.0, 1.0]]), array([[2.5, 2.0]])), [[0.5, -1.0]])
 
 
-def test_penetration_is_a_tenth_of_the_logarithm_of_the_room_in_radians():
-    limits = tensor([[-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5]])
-    got = losses.penetration(tensor([0.1, -0.5 + math.exp(-3), 0.5, -0.6]), limits)
+def test_penetration_is_a_tenth_of_the_logarithm_of_the_room_in_radians(array):
+    limits = array([[-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5]])
+    got = losses.penetration(array([0.1, -0.5 + math.exp(-3), 0.5, -0.6]), limits)
     expected = [[-0.1 * math.log(0.6), -0.1 * math.log(0.4)], [0.3, -0.1 * math.log(1 - math.exp(-3))]]
     np.testing.assert_allclose(got[:2], expected, rtol=1e-14)
     assert got[2].tolist() == pytest.approx([0.0, math.inf])
     assert got[3].tolist() == pytest.approx([math.inf, -0.1 * math.log(1.1)])
 
 
-def test_slack_track_and_smooth_measure_newtons_and_millimetres():
-    np.testing.assert_allclose(losses.slack(tensor([[1.0, 2.0, 0.3]]), 0.05), [[1.0, 2.0, 6.0]])
-    got = losses.track(tensor([0.3]), tensor([0.01]), tensor([0.1]), tensor([0.012]), 0.05)
+def test_slack_track_and_smooth_measure_newtons_and_millimetres(array):
+    np.testing.assert_allclose(losses.slack(array([[1.0, 2.0, 0.3]]), 0.05), [[1.0, 2.0, 6.0]])
+    got = losses.track(array([0.3]), array([0.01]), array([0.1]), array([0.012]), 0.05)
     np.testing.assert_allclose(got, [[10.0, -2.0]])
-    go = tensor([[0.0, 0.0, 0.1], [0.001, -0.002, 0.2], [0.001, 0.0, 0.2]])
+    go = array([[0.0, 0.0, 0.1], [0.001, -0.002, 0.2], [0.001, 0.0, 0.2]])
     np.testing.assert_allclose(losses.smooth(go, 0.05), [[1.0, -2.0, 5.0], [0.0, 2.0, 0.0]], atol=1e-15)
 
 
-def test_a_barrier_is_nothing_in_the_middle_and_infinite_from_the_limit_on():
-    got = losses.barrier(tensor([0.0, 0.75, 1.0, 1.5, math.nan, math.inf]))
+def test_a_barrier_is_nothing_in_the_middle_and_infinite_from_the_limit_on(array):
+    got = losses.barrier(array([0.0, 0.75, 1.0, 1.5, math.nan, math.inf]))
     np.testing.assert_allclose(got, [0.0, 0.1 * math.log(4), *[math.inf] * 4])
 
 
-def test_the_workspace_is_a_barrier_per_coordinate():
-    limits = tensor([[0.0, 2.0], [-1.0, 1.0], [-0.4, 0.4]])
-    got = losses.workspace(tensor([[1.5, 0.0, -0.2], [1.0, 1.0, 0.0]]), limits)
+def test_the_workspace_is_a_barrier_per_coordinate(array):
+    limits = array([[0.0, 2.0], [-1.0, 1.0], [-0.4, 0.4]])
+    got = losses.workspace(array([[1.5, 0.0, -0.2], [1.0, 1.0, 0.0]]), limits)
     quarter = -0.1 * math.log(1 - 0.25)
     np.testing.assert_allclose(got, [[quarter, 0.0, quarter], [0.0, math.inf, 0.0]], atol=1e-16)
 
 
-def test_the_sensor_has_a_barrier_for_its_force_and_one_for_its_torque():
-    wrench = tensor([[3.0, -4.0, 0.2], [0.0, 0.0, 0.0], [0.0, 11.0, 0.0]])
+def test_the_sensor_has_a_barrier_for_its_force_and_one_for_its_torque(array):
+    wrench = array([[3.0, -4.0, 0.2], [0.0, 0.0, 0.0], [0.0, 11.0, 0.0]])
     both = losses.sensor(wrench, 10.0, 0.4)
     quarter = -0.1 * math.log(1 - 0.25)
     np.testing.assert_allclose(both, [[quarter, quarter], [0.0, 0.0], [math.inf, 0.0]])
@@ -92,28 +98,28 @@ def forward(a: PlanarArm, readings) -> np.ndarray:
 
 
 @pytest.mark.parametrize("elbow", [1, -1])
-def test_the_joints_found_for_a_pose_lead_forward_to_it(elbow):
+def test_the_joints_found_for_a_pose_lead_forward_to_it(array, elbow):
     rng = np.random.default_rng(4)
     zero = rng.uniform(-1, 1, 3)
     a = arm(elbow, zero=zero, limits=zero[:, None] + [[-math.pi, math.pi]] * 3)
     for _ in range(50):
         q = zero + rng.uniform(-3, 3, 3) * [1, 0, 1] + [0, elbow * rng.uniform(0.05, 3.0), 0]
-        found, reachable = losses.joint_readings(a, tensor(forward(a, q)))
+        found, reachable = losses.joint_readings(a, array(forward(a, q)))
         assert reachable
         np.testing.assert_allclose(found, q, atol=1e-11)
 
 
-def test_of_equal_angles_the_one_near_the_joint_s_middle_is_taken():
+def test_of_equal_angles_the_one_near_the_joint_s_middle_is_taken(array):
     a = arm(limits=((4.0, 8.0), (-3.0, 3.0), (-8.0, -4.0)))
     q = np.array([6.0, 1.0, -6.0])
-    found, _ = losses.joint_readings(a, tensor(forward(a, q)))
+    found, _ = losses.joint_readings(a, array(forward(a, q)))
     np.testing.assert_allclose(found, q, atol=1e-12)
 
 
-def test_joints_are_a_barrier_each_and_infinite_out_of_reach():
+def test_joints_are_a_barrier_each_and_infinite_out_of_reach(array):
     a = arm(limits=((0.0, 2.0), (0.0, 2.0), (-1.0, 1.0)))
     ee = np.array([forward(a, [1.5, 1.0, 0.5]), forward(a, [2.5, 1.0, 0.0]), [5.0, 5.0, 0.0], [0.4, -0.25, 0.0]])
-    got = losses.joints(tensor(ee), a)
+    got = losses.joints(array(ee), a)
     quarter = -0.1 * math.log(1 - 0.25)
     np.testing.assert_allclose(got[0], [quarter, 0.0, quarter], atol=1e-13)
     assert got[1, 0] == math.inf

@@ -9,9 +9,11 @@ import torch
 
 from mechanics.friction import Mode
 from planning.errors import InfeasiblePlan
-from planning.objective import OutsideBarrier, TorchObjective, backend_of, evaluate, program
+from planning.evaluation import OutsideBarrier, backend_of, evaluate
+from planning.fused.objective import FusedObjective
+from planning.objective import TorchObjective
 from planning.problem import Form, Limits, LossWeights, PlanarArm, Touch
-from planning.trajectory import pose, residuals
+from planning.trajectory import pose, program, residuals
 
 from .problems import KINDS, clockwise, cross, pivoting_pentagon, random_problem, random_z, turn
 
@@ -41,10 +43,11 @@ def contact_forces(found, k):
     ]
 
 
+@pytest.mark.parametrize("backend", ["torch", "fused"])
 @pytest.mark.parametrize("kind", KINDS, ids=str)
-def test_both_bodies_are_in_balance_and_the_finger_bears_the_rest(kind):
+def test_both_bodies_are_in_balance_and_the_finger_bears_the_rest(kind, backend):
     problem = problem_of(kind, seed=1)
-    found = evaluate(problem, random_z(problem, np.random.default_rng(2)))
+    found = evaluate(problem, random_z(problem, np.random.default_rng(2)), backend)
     assert set(found.solution.status) == {"solved"}
     n, slack = len(problem.contacts), 0.0
     for k in range(problem.steps):
@@ -69,10 +72,11 @@ def test_both_bodies_are_in_balance_and_the_finger_bears_the_rest(kind):
         assert found.terms["slack"] == pytest.approx(problem.weights.slack * slack / problem.steps, rel=1e-9)
 
 
+@pytest.mark.parametrize("backend", ["torch", "fused"])
 @pytest.mark.parametrize("kind", KINDS, ids=str)
-def test_forces_meet_their_modes(kind):
+def test_forces_meet_their_modes(kind, backend):
     problem = problem_of(kind, seed=3)
-    found = evaluate(problem, random_z(problem, np.random.default_rng(4)))
+    found = evaluate(problem, random_z(problem, np.random.default_rng(4)), backend)
     relaxed = problem.eo_body is not None
     assert found.names == tuple(c.name for c in (*problem.contacts, *problem.ground))
     for k in range(problem.steps):
@@ -254,9 +258,10 @@ def ground_force(problem, z):
     return np.linalg.solve(columns, -found.eo_load[..., None])[:, 1:, 0]
 
 
-def test_an_infeasible_step_makes_one_member_of_a_batch_infinite_and_is_named():
+@pytest.mark.parametrize("loss", [TorchObjective, FusedObjective])
+def test_an_infeasible_step_makes_one_member_of_a_batch_infinite_and_is_named(loss):
     problem = replace(sliding_block(), weights=LossWeights(penetration=0.0))
-    objective, z = TorchObjective(problem), problem.start
+    objective, z = loss(problem), problem.start
     turned = np.repeat(z[None], 121, axis=0)  # the face at step 1, until the ground cannot hold the eo
     turned[:, 1, 0] += np.linspace(-60, 60, 121)
     f_n, f_t = ground_force(problem, turned).reshape(121, 3, 2)[:, 1].T
@@ -293,11 +298,12 @@ BARRIERS = {
 }
 
 
+@pytest.mark.parametrize("loss", [TorchObjective, FusedObjective])
 @pytest.mark.parametrize("name", BARRIERS)
-def test_outside_a_barrier_the_loss_is_infinite_and_the_refusal_has_the_figure(name):
+def test_outside_a_barrier_the_loss_is_infinite_and_the_refusal_has_the_figure(name, loss):
     limits, message = BARRIERS[name]
     problem = pivoting_pentagon(steps=3)
-    objective = TorchObjective(replace(problem, limits=limits(problem)))
+    objective = loss(replace(problem, limits=limits(problem)))
     z = objective.start
     assert objective.values(z[None]) == [np.inf]
     assert objective.gradient(z)[0] == objective.quadratic(z).value == objective.evaluate(z).value == np.inf
@@ -307,9 +313,10 @@ def test_outside_a_barrier_the_loss_is_infinite_and_the_refusal_has_the_figure(n
         raise refusal
 
 
-def test_penetration_is_refused_with_the_angle_and_its_limits():
+@pytest.mark.parametrize("loss", [TorchObjective, FusedObjective])
+def test_penetration_is_refused_with_the_angle_and_its_limits(loss):
     problem = pivoting_pentagon(steps=3)
-    objective, z = TorchObjective(problem), problem.start + 0
+    objective, z = loss(problem), problem.start + 0
     z[2, 0] = np.radians(37) / problem.scale[0]
     assert objective.values(np.stack([z, problem.start]))[0] == np.inf
     refusal = objective.refusal(z)
@@ -332,25 +339,43 @@ def test_infinite_values_never_become_nan():
     assert (values[1:] == np.inf).all()
 
 
-def test_a_wrong_z_is_refused():
+@pytest.mark.parametrize("loss", [TorchObjective, FusedObjective])
+def test_a_wrong_z_is_refused(loss):
     problem = pivoting_pentagon(steps=3)
-    objective, z = TorchObjective(problem), problem.start
+    objective, z = loss(problem), problem.start
     with pytest.raises(ValueError, match=r"z: expected shape \(3, 5\), received \(2, 5\)"):
         objective.gradient(z[:2])
     with pytest.raises(ValueError, match=r"z: expected shape \(B, 3, 5\), received \(3, 5\)"):
         objective.values(z)
     bad = z + 0
     bad[1, 2] = np.nan
-    with pytest.raises(ValueError, match="z: step 1: expected finite numbers"):
-        objective.quadratic(bad)
+    for ask in (objective.quadratic, objective.refusal):
+        with pytest.raises(ValueError, match="z: step 1: expected finite numbers"):
+            ask(bad)
+
+
+def test_an_unknown_backend_is_refused():
     with pytest.raises(ValueError, match=r"backend: expected one of .*torch.*, received 'osqp'"):
-        TorchObjective(problem, "osqp")
+        TorchObjective(pivoting_pentagon(steps=3), "osqp")
 
 
 def test_without_any_loss_the_value_is_zero():
     objective = TorchObjective(replace(pivoting_pentagon(steps=3), weights=NO_WEIGHTS))
     assert objective.gradient(objective.start)[0] == 0
     assert (objective.values(objective.start[None]) == 0).all()
+
+
+@pytest.mark.parametrize("kind", [KINDS[0], KINDS[9], KINDS[22]], ids=str)
+def test_the_residuals_in_numpy_and_in_torch_are_the_same(kind):
+    problem = problem_of(kind, seed=4, steps=3, limits=True)
+    z = random_z(problem, np.random.default_rng(1))
+    forces = evaluate(problem, z).forces
+    plain = residuals(problem, pose(problem, z), forces)
+    tensors = residuals(problem, pose(problem, torch.from_numpy(z)), torch.from_numpy(forces))
+    assert list(plain) == list(tensors)
+    for name, residual in plain.items():
+        assert isinstance(residual, np.ndarray)
+        np.testing.assert_allclose(tensors[name], residual, rtol=1e-12, atol=1e-14, err_msg=name)
 
 
 def test_the_program_in_numpy_and_in_torch_is_the_same():

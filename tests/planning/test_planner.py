@@ -3,6 +3,8 @@
 import json
 import math
 import pickle
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 
 from mechanics.friction import Mode
 from planning.errors import InfeasiblePlan
-from planning.objective import TorchObjective
+from planning.fused.objective import FusedObjective
 from planning.optimisers.base import Optimiser, Optimum
 from planning.optimisers.gradient import Gradient
 from planning.optimisers.lm import LevenbergMarquardt
@@ -186,7 +188,7 @@ def test_provenance_says_how_the_plan_came_about(task_of):
     told = p.provenance
     assert (p.planner, p.queries, told["git"]) == ("gradient", 7, "v1.2-3-gabc")
     assert told["optimiser"] == {"name": "gradient", "iterations": 7, "rate": 0.2, "betas": [0.9, 0.999], "eps": 1e-8}
-    assert (told["objective"], told["form"], told["ended"]) == ("TorchObjective", "closed", "iterations")
+    assert (told["objective"], told["form"], told["ended"]) == ("FusedObjective", "closed", "iterations")
     assert len(told["curve"]) == 7
     assert math.isclose(min(told["curve"]), p.loss, rel_tol=1e-9)
     assert math.isclose(sum(told["terms"].values()), p.loss, rel_tol=1e-9)
@@ -200,6 +202,41 @@ def test_provenance_says_how_the_plan_came_about(task_of):
 def test_without_an_optimiser_the_nominal_trajectory_is_the_plan(task_of):
     p = plan(task_of("grasped_static"), "p")
     assert (p.planner, p.queries, p.provenance["optimiser"]) == ("nominal", 1, None)
+
+
+def test_a_plan_needs_no_torch():
+    """Its import takes longer than all the rest of planning."""
+    code = """
+import sys
+
+import numpy as np
+
+from mechanics.catalogue import load_object
+from planning.errors import InfeasiblePlan
+from planning.optimisers.lm import LevenbergMarquardt
+from planning.planner import check, plan
+from planning.problem import Form, Limits
+from planning.skills.base import SKILLS, Extrinsic, Held, Scene
+
+tall, low = load_object("tall_box"), load_object("hbox")
+rho = tall.polygon.radius_of_gyration
+held = Held(tall.polygon.vertices, tall.mass, np.array([0.0, 0.045, 0.0]), np.diag([2e3, 2e3, 3.0]), 0.33, rho=rho)
+scene = Scene(held, Extrinsic(low.polygon.vertices, low.mass, 0.33, 0.33))
+skill = SKILLS["static_in_contact"]
+for form in Form:
+    for optimiser in (None, LevenbergMarquardt(iterations=5)):
+        made = plan(skill.task(skill.Parameters(steps=3), scene, form=form), "p", optimiser=optimiser)
+        assert made.status == "solved", made.provenance["shortfalls"]
+try:
+    check(skill.task(skill.Parameters(steps=3), scene, limits=Limits(force=0.5)))
+except InfeasiblePlan as refused:
+    assert "sensor" in str(refused), refused
+else:
+    raise AssertionError("not refused")
+assert "torch" not in sys.modules
+"""
+    found = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=100)
+    assert found.returncode == 0, found.stderr
 
 
 def test_the_same_seed_gives_the_same_plan(task_of):
@@ -276,7 +313,7 @@ def test_a_result_that_is_not_what_was_asked_for_is_inaccurate_and_says_why(task
 
 
 def test_a_result_without_forces_makes_no_plan(task_of):
-    class GivesUp(TorchObjective):
+    class GivesUp(FusedObjective):
         def evaluate(self, z):
             found = super().evaluate(z)
             status = tuple("failed" if k == 2 else word for k, word in enumerate(found.solution.status))

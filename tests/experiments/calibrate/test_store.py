@@ -19,6 +19,7 @@ from experiments.calibrate.models import (
     TagCalibration,
 )
 from experiments.files import Resolved, load
+from experiments.planning import make
 from mechanics.yaml_input import InputError
 
 K = ((2500.0, -100.0, 10.0), (-100.0, 2000.0, -12.0), (10.0, -12.0, 3.0))
@@ -111,8 +112,8 @@ def test_the_planner_plans_with_the_calibrated_figures() -> None:
     of = resolved()
     store.save(store.folder_of(of), elasticity(of))
     stage = of.experiment.stages[0]
-    task = setup.task(of, stage, setup.believed(of, store.load(of)))  # type: ignore[arg-type]
-    np.testing.assert_array_equal(task.stiffness, K)
+    task = make.task(of, stage, setup.believed(of, store.load(of)))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(task.problem.stiffness, K)
 
 
 def test_nothing_is_taken_where_the_experiment_says_none_or_nothing_lies_there() -> None:

@@ -1,0 +1,89 @@
+"""The problem that `extrinsic bench planning` measures on: the pivoting pentagon, at any horizon and in either form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from experiments import setup
+from experiments.calibrate.store import Calibrations
+from experiments.files import Resolved, load
+from experiments.planning.make import planning_scene
+from experiments.planning.schema import PlanStage
+from mechanics.readings import Array
+from planning.optimisers.base import Objective
+from planning.problem import Form, Problem
+
+EXPERIMENT = "extrinsic_pivoting"
+#: how far off the nominal trajectory measurements begin, 1σ in units of z: about 1 mm, 1 N
+AWAY = 0.1
+#: by how much the estimate of the grasp moves between two re-plans, 1σ [m, m, rad]
+GRASP_NOISE = np.array([2e-4, 2e-4, np.radians(0.2)])
+
+
+@cache
+def _resolved() -> Resolved:
+    return load(EXPERIMENT)
+
+
+def pivoting_pentagon(steps: int, form: Form) -> Problem:
+    """The plan stage of the shipped experiment over ``steps``: the same motion, cut finer."""
+    from experiments import registries
+
+    resolved = _resolved()
+    stage = next(stage for stage in resolved.experiment.stages if isinstance(stage, PlanStage))
+    skill = registries.skills()[stage.skill]
+    parameters = stage.skill_parameters.model_copy(update={"steps": steps})
+    scene = planning_scene(resolved, setup.believed(resolved, Calibrations()))
+    return skill.task(parameters, scene, form=form, weights=stage.loss_weights()).problem
+
+
+def window(problem: Problem, begin: int, steps: int) -> Problem:
+    """``steps`` steps of a problem from ``begin`` on."""
+    cut = slice(begin, begin + steps)
+
+    def of(thing: Any, *names: str) -> dict[str, Any]:
+        return {name: getattr(thing, name)[cut] for name in names}
+
+    return replace(
+        problem,
+        **of(problem, "eo", "angle", "travel", "free", "angle_limits"),
+        contacts=tuple(replace(contact, **of(contact, "modes", "wish")) for contact in problem.contacts),
+        ground=tuple(replace(contact, **of(contact, "modes")) for contact in problem.ground),
+    )
+
+
+def disturbed(problem: Problem, objective: Objective, rng: np.random.Generator, away: float = AWAY) -> Array:
+    """z (K, 5) off the nominal trajectory by ``away`` (1σ) in every free variable, where the loss is finite."""
+    for _ in range(1000):
+        z = problem.start + away * np.where(problem.free, rng.standard_normal(problem.free.shape), 0.0)
+        if np.isfinite(objective.values(z[None])[0]):
+            return z
+    raise ValueError("bench: expected a finite loss somewhere near the nominal trajectory")
+
+
+def regrasped(problem: Problem, rng: np.random.Generator) -> Problem:
+    """The problem with the grasp where an estimator may have it next."""
+    return replace(problem, grasp=np.asarray(problem.grasp) + GRASP_NOISE * rng.standard_normal(3))
+
+
+def shifted(z: Array) -> Array:
+    """z (K, D) one step further on: the last step stands twice."""
+    return np.concatenate([z[1:], z[-1:]])
+
+
+def described(problem: Problem) -> str:
+    """The problem in words."""
+    resolved = _resolved()
+    eo, mu = resolved.extrinsic, resolved.friction
+    assert eo is not None
+    angles = np.degrees(problem.eo[[0, -1], 2])
+    wish = problem.contacts[0].wish[0, 0]
+    return (
+        f"{eo.name}, {eo.mass:g} kg, turned from {angles[0]:.3g}° to {angles[1]:.3g}° at {wish:.3g} N, µ "
+        f"{mu['go-eo']:g} at the object and {mu['eo-ground']:g} at the ground, {problem.form.value} form, "
+        f"from {AWAY:g} mm and {AWAY:g} N (1σ) off the skill's nominal trajectory"
+    )

@@ -1,0 +1,92 @@
+"""What a trial learns besides the errors: where the go is touched, and what the sensor under the table says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from control.closed_loop import ClosedLoop
+from control.settings import TrialSettings
+from control.trial import TrialResult
+from experiments import setup
+from experiments.calibrate.store import Calibrations
+from mechanics import se2
+
+from .test_trial import STEPS, Station
+
+
+class Roles:
+    """The devices of a `Station` by their roles."""
+
+    def __init__(self, station: Station):
+        self._devices = station.devices
+        self.arm, self.camera = station.arm, self._devices["camera"]
+
+    def force_torque(self, mount):
+        return self._devices[f"{mount}_ft"]
+
+
+def whole_observer(station: Station):
+    known = setup.believed(station.resolved, Calibrations())
+    return setup.observer(station.resolved, Roles(station), TrialSettings(), known)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def pressed() -> tuple[Station, TrialResult, list]:
+    """A closed-loop trial that has run, and the plant's truth at its waypoints."""
+    station, truths = Station(), []
+
+    class Waypoints(list):
+        def append(self, record):
+            super().append(record)
+            truths.append(station.world.truth())
+
+    station.waypoints = Waypoints()
+    result = station.run(ClosedLoop, observer=whole_observer(station))
+    return station, result, truths
+
+
+def test_where_the_object_is_touched_is_recorded_at_every_waypoint(pressed):
+    _, result, truths = pressed
+    assert result.status == "completed", result.reason
+    assert len(result.waypoints) == len(truths) == STEPS
+    for waypoint, truth in zip(result.waypoints, truths, strict=True):
+        [touch] = [contact for contact in truth.contacts if contact.on == "go"]
+        assert waypoint.contact is not None and waypoint.contact.point is not None
+        assert waypoint.contact.point == pytest.approx(se2.transform(se2.inverse(truth.go), touch.point), abs=1e-4)
+
+
+def test_the_table_bears_what_the_wrist_says(pressed):
+    station, result, _ = pressed
+    assert len(result.witness) == STEPS
+    for found in result.witness:
+        assert found.agrees and np.hypot(*found.difference) < 0.01
+    assert [event for event in station.events if event[0] == "warning"] == []
+
+
+def test_a_wrist_that_is_wrong_is_told_of_once_and_the_trial_goes_on():
+    station = Station()
+    wrist = station.devices["wrist_ft"]
+    read = wrist._read
+    wrong = np.array([0.8, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+    def reading():
+        true = read()
+        return replace(true, wrench=true.wrench + wrong) if station.phases[-1:] == ["trajectory"] else true
+
+    wrist._read = reading
+    result = station.run(observer=whole_observer(station))
+    assert result.status == "completed", result.reason
+    assert [found.agrees for found in result.witness] == [False] * STEPS
+    [warning] = [text for level, text in station.events if level == "warning"]
+    assert "under the table" in warning and "waypoint 0" in warning
+
+
+def test_a_silent_sensor_under_the_table_is_no_witness_and_no_failure():
+    station = Station()
+    station.devices["table_ft"].since = lambda _capture_ns: []
+    result = station.run(observer=whole_observer(station))
+    assert result.status == "completed", result.reason
+    assert result.witness == []
