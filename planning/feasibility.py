@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -272,7 +273,7 @@ def _least(lacks: Callable[[float], float], has: float, slips: bool) -> float | 
             around = float(grid[max(i - 1, 0)]), float(grid[min(i + 1, len(grid) - 1)])
             from scipy.optimize import minimize_scalar
 
-            nearest = minimize_scalar(lacks, bounds=around, method="bounded", options={"xatol": 1e-9})
+            nearest: Any = minimize_scalar(lacks, bounds=around, method="bounded", options={"xatol": 1e-9})
             return float(nearest.x) if nearest.fun <= 10 * BALANCED else None
     if high is None:
         return None
