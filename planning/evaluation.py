@@ -13,9 +13,10 @@ from array_api_compat import is_torch_array
 from mechanics.friction import Mode
 from mechanics.readings import Array
 from planning import losses, trajectory
+from planning.backends import BACKENDS
 from planning.errors import InfeasiblePlan
 from planning.problem import VARIABLES, Problem
-from planning.program import BACKENDS, Backend, ContactProgram, Solution
+from planning.program import Backend, ContactProgram, Solution
 from planning.trajectory import Posed
 
 

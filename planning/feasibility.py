@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mechanics.friction import required_friction
 from mechanics.readings import Array
 from planning.errors import InfeasiblePlan
-from planning.program import BACKENDS, FREE, STICK, ContactProgram, as_numpy, force_scale, take
+from planning.program import FREE, STICK, ContactProgram, as_numpy, force_scale, take
 
 BALANCED = 1e-6
 """What balance may lack, relative to the step's force scale."""
@@ -141,7 +141,9 @@ def margins(
     if given.eo_jacobian is None:
         raise ValueError("margins: program: expected one with an extrinsic object's balance (P1)")
     if forces is None:
-        solution = BACKENDS["fused"]()(given)
+        from planning.qp_fused import solve
+
+        solution = solve(given)
         if not solution.usable.all():
             check(given)
             k = int(np.argmin(solution.usable))

@@ -153,39 +153,6 @@ Backend: TypeAlias = Callable[[ContactProgram], Solution]
 """Something that solves a `ContactProgram`."""
 
 
-def _cvxpylayers() -> Backend:
-    from planning.qp_reference import solve_accurate
-
-    return solve_accurate
-
-
-def _cvxpylayers_fast() -> Backend:
-    from planning.qp_reference import solve_fast
-
-    return solve_fast
-
-
-def _torch() -> Backend:
-    from planning.qp_torch import solve
-
-    return solve
-
-
-def _fused() -> Backend:
-    from planning.qp_fused import solve
-
-    return solve
-
-
-BACKENDS: dict[str, Callable[[], Backend]] = {
-    "cvxpylayers": _cvxpylayers,
-    "cvxpylayers-fast": _cvxpylayers_fast,
-    "torch": _torch,
-    "fused": _fused,
-}
-"""Every backend by name, each imported only when it is asked for."""
-
-
 def take(program: ContactProgram, steps: Iterable[int] | slice) -> ContactProgram:
     """Return the program of some ``steps`` only."""
     index = steps if isinstance(steps, slice) else np.array(list(steps), dtype=np.intp)

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from mechanics.friction import Mode
+from planning.backends import BACKENDS
 from planning.program import (
-    BACKENDS,
     FREE,
     SLIP_MINUS,
     SLIP_PLUS,
