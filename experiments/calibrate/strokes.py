@@ -9,6 +9,7 @@ import numpy as np
 
 from drivers.errors import CommandRefused
 from drivers.interfaces import ForceTorqueSensor
+from estimation.errors import FitError
 from experiments.calibrate.rig import Rig
 from mechanics import se2
 from mechanics.contact import gravity_wrench
@@ -25,6 +26,10 @@ BIN = 0.02
 TOUCHED = 0.5
 #: share of a stroke in which it gets up to its speed, and of it that it takes to stop
 GETTING_UP = 0.2
+#: and what the object swings in the fingers after it has [s]
+SWINGING = 0.1
+#: a stroke that moves evenly for less than this shows too little [s]
+LEAST_EVEN = 0.1
 #: how often the normal force is corrected before a stroke, and the largest step of it [m]
 CORRECTIONS, STEP = 3, 0.001
 
@@ -96,9 +101,17 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Array:
 
     t is the normal turned by −90°. The mean of what `witnesses` say; each one's zero is taken before touch-down and
     after the stroke, and drifts evenly in between. Before the stroke the normal force is brought to what is asked,
-    since nobody knows the grasp to the last tenth.
+    since nobody knows the grasp to the last tenth. Raises FitError for a stroke too short to tell anything.
     """
     length = abs(stroke.end - stroke.begin)
+    even = (1 - 2 * GETTING_UP) * length / speed - SWINGING
+    if even < LEAST_EVEN:
+        raise FitError(
+            "a stroke",
+            f"{LEAST_EVEN:g} s of even motion",
+            f"{max(even, 0.0):.2g} s: {length * 1e3:.3g} mm at {speed * 1e3:.3g} mm/s",
+            "Make it longer, or slower: `stroke_mm`, `speed`.",
+        )
     along = np.linspace(stroke.begin, stroke.end, max(2, int(length / 0.001)))
     pressed = dragged.poses(stroke.tilt, along, np.full(len(along), stroke.force))
     loading = dragged.poses(stroke.tilt, np.full(10, along[0]), np.linspace(0.0, stroke.force, 10))
@@ -138,9 +151,10 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Array:
 
 
 def _dragged(rig: Rig, path: Array, seconds: float) -> tuple[int, int]:
-    """Move along ``path`` (M, 3), evenly but for the `GETTING_UP` at both ends; returns when it was even [ns].
+    """Move along ``path`` (M, 3), evenly but for the `GETTING_UP` at both ends.
 
-    A wrist sensor feels what it takes to speed up the tool as well, and that is no friction.
+    Returns from when to when everything moved evenly [ns]: a wrist sensor feels what it takes to speed up the tool as
+    well, and that is no friction.
     """
     mover, a = rig.mover, GETTING_UP
     ticks = max(10, round(seconds * rig.context.settings.control_rate))
@@ -154,7 +168,7 @@ def _dragged(rig: Rig, path: Array, seconds: float) -> tuple[int, int]:
     begin = end = rig.devices.clock.now_ns()
     for at, point, slope in zip(u, points, slopes * speed[:, None] / seconds, strict=True):
         mover.follow(point, slope)
-        if at <= a:
+        if at * seconds <= a * seconds + SWINGING:
             begin = rig.devices.clock.now_ns()
         if at <= 1 - a:
             end = rig.devices.clock.now_ns()
