@@ -4,7 +4,7 @@
     layout       where things lie in the shared arrays   geometry     variables → program, and its derivatives
     pack         a Problem as flat arrays                residuals    the losses of a step
     batch        many programs                           trajectory   the loss of a trajectory, Adam
-    objective    `FusedObjective`
+    objective    `FusedObjective`                        adjoint      the gradient of a step, backwards
 
 The first use after an installation compiles the kernels; `warm` does it ahead. Nothing is compiled at import.
 """

@@ -75,10 +75,10 @@ from planning.fused.layout import (
     Y,
 )
 from planning.fused.program import respond
-from planning.fused.sources import kernel
+from planning.fused.sources import inlined, kernel
 
 
-@kernel
+@inlined
 def place(w, c, kinds, steps, fixed, flags, k):
     """Write the poses, the contacts and the loads at the variables in row Y."""
     angle, travel = w[Y, 0], w[Y, 1]
@@ -158,7 +158,7 @@ def place(w, c, kinds, steps, fixed, flags, k):
         w[LOAD_GO, 2] = w[WRENCH, 2] + gx * fixed[GO_WEIGHT]  # the weight acts at −(gx, gy) from the grasp centre
 
 
-@kernel
+@inlined
 def _lever(c, at, rows, ax, ay, sign):
     """Write a contact's Jacobian on a body to whose origin the lever is (ax, ay)."""
     nx, ny = sign * c[at, N_X], sign * c[at, N_Y]
@@ -166,7 +166,7 @@ def _lever(c, at, rows, ax, ay, sign):
     c[at, rows + 3], c[at, rows + 4], c[at, rows + 5] = ny, -nx, -ax * nx - ay * ny
 
 
-@kernel
+@inlined
 def forces_in_world(c, contacts):
     """Write the forces found in the axes of W."""
     for at in range(contacts):
@@ -179,6 +179,7 @@ def forces_in_world(c, contacts):
 def differentiate(w, c, i, kinds, free, steps, fixed, flags, k):
     """Write the derivatives of the object contacts' forces with the free variables, times their scale, to rows DF.
 
+    The model of second order needs each of them; the gradient alone does without (`planning.fused.adjoint`).
     The implicit function theorem on the active rows: with the data's derivatives δ, the forces' solve the program
     with target U δf_des + δJ_eo ν − δJ_go ω, right sides −δJ_eoᵀ f and slack √W (δgo_load + δJ_goᵀ f).
     """

@@ -45,7 +45,9 @@ DF = 82  # 4 rows: of (f_n, f_t) of the two object contacts; from here on column
 DW, DEE = 86, 89  # 3 rows each: of the sensor's wrench, of the end-effector
 DQ = 92  # 3 rows, columns x, y, θ: of the joints with the end-effector
 RES = 95  # of the residual at hand
-ROWS = 96
+BY_F, BY_Z, BY_WRENCH, BY_EE = 96, 97, 98, 99  # derivative of the loss by forces (n, t of each), slack, wrench, hand
+BACK, BASE_BACK, Z_BACK, NU_BACK = 100, 101, 102, 103  # and by target, right sides, slack of the program, the balance
+ROWS = 104
 
 # --- integers -------------------------------------------------------------------------------------------------------
 UNKNOWNS, EDGE_ROWS, EQUAL_RANK, RANK, NEXT = 0, 1, 2, 3, 4

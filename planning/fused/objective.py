@@ -26,10 +26,15 @@ class FusedObjective:
 
     def __init__(self, problem: Problem):
         self.problem = problem
-        self.start, self.free = problem.start, problem.free
+        self.free = problem.free
         self._data = pack(problem)
         self._warm = np.zeros(problem.steps, np.int64)
         self._none, self._adam = np.empty((1, VARIABLES, VARIABLES)), (np.empty((1, VARIABLES)), 0.0, 0.0, 0.0, 0.0)
+
+    @property
+    def start(self) -> Array:
+        """z (K, 5) at the nominal values; found when it is first asked for, which takes longer than all else here."""
+        return self.problem.start
 
     def values(self, z: Array) -> Array:
         """Return the loss (B,) of ``z`` (B, K, 5): +inf outside a barrier or where a program has no solution."""

@@ -7,14 +7,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mechanics import se2
-from mechanics.friction import tangent
+from mechanics.friction import Mode, tangent
+from mechanics.readings import Array
 from planning.fused import layout
 from planning.problem import Form, Problem, Touch
 from planning.program import ContactProgram, codes
 from planning.qp_fused import kinds_of
 
 LENGTH = next(field.default for field in ContactProgram.__dataclass_fields__.values() if field.name == "length")
+
+_CODES = {mode: int(codes([mode])[0]) for mode in Mode}
 
 
 class Packed(NamedTuple):
@@ -41,20 +43,37 @@ def pack(problem: Problem) -> Packed:
     relaxed = (two,) * n + (False,) * m
     contacts = (*problem.contacts, *problem.ground)
     mu = np.tile([contact.mu for contact in contacts], (problem.steps, 1))
-    kinds, slope = kinds_of(codes([contact.modes for contact in contacts]).T, mu, relaxed)
+    modes = np.array([[_CODES[mode] for mode in contact.modes] for contact in contacts], np.int8)
+    kinds, slope = kinds_of(modes.T, mu, relaxed)
     return Packed(
         np.ascontiguousarray(kinds),
         _steps(problem, slope),
         _fixed(problem),
         _flags(problem),
         np.ascontiguousarray(problem.free, dtype=np.int8),
-        np.array(problem.start),
+        _start(problem),
     )
+
+
+def _start(problem: Problem) -> NDArray[np.float64]:
+    """Return z (K, 5) of which what is not free is right: where the paper form's v is free, it need not be found."""
+    if problem.form is Form.CLOSED or not problem.free[:, 2:].all():
+        return np.array(problem.start)
+    start = np.zeros(problem.free.shape)
+    start[:, 0], start[:, 1] = problem.angle / problem.scale[0], problem.travel / problem.scale[1]
+    return start
 
 
 def _steps(problem: Problem, slope: NDArray[np.float64]) -> NDArray[np.float64]:
     steps = np.zeros((problem.steps, layout.STEP))
     eo = np.asarray(problem.eo)
+    co, si = np.cos(eo[:, 2]), np.sin(eo[:, 2])
+
+    def put(at: int, vector: Array) -> None:
+        """Enter a vector of the eo's frame, in W. The checks of `mechanics.se2` take longer than all the rest here."""
+        x, y = vector
+        steps[:, at], steps[:, at + 1] = co * x - si * y, si * x + co * y
+
     steps[:, layout.THETA_EO] = eo[:, 2]
     steps[:, layout.EO_X], steps[:, layout.EO_Y] = eo[:, 0], eo[:, 1]
     steps[:, layout.ANGLE], steps[:, layout.TRAVEL] = problem.angle, problem.travel
@@ -64,13 +83,15 @@ def _steps(problem: Problem, slope: NDArray[np.float64]) -> NDArray[np.float64]:
         at = layout.OBJECT + 6 * c
         eo_owns_face = contact.touch is Touch.CORNER_ON_FACE
         into = -contact.normal if eo_owns_face == (problem.eo_body is not None) else contact.normal
-        steps[:, at : at + 2] = se2.transform(eo, contact.p_eo)
+        put(at, contact.p_eo)
+        steps[:, at : at + 2] += eo[:, :2]
         if eo_owns_face:
-            steps[:, at + 2 : at + 4] = se2.rotate(eo[:, 2], tangent(contact.normal))
-        steps[:, at + 4 : at + 6] = se2.rotate(eo[:, 2], into) if eo_owns_face else into
+            put(at + 2, tangent(contact.normal))
+            put(at + 4, into)
+        else:
+            steps[:, at + 4 : at + 6] = into
     for g, ground in enumerate(problem.ground):
-        at = layout.GROUND + 2 * g
-        steps[:, at : at + 2] = se2.rotate(eo[:, 2], ground.p_eo)
+        put(layout.GROUND + 2 * g, ground.p_eo)
     steps[:, layout.SLOPE : layout.SLOPE + slope.shape[1]] = slope
     return steps
 

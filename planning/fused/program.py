@@ -63,7 +63,7 @@ from planning.fused.layout import (
     R,
     Z,
 )
-from planning.fused.sources import kernel
+from planning.fused.sources import inlined
 
 SOLVED, INACCURATE, INFEASIBLE, FAILED = 0, 1, 2, 3
 EXACT, ROUGH = 1e-9, 1e-6
@@ -76,7 +76,7 @@ GUESSES = 8
 """Sets of active rows that are tried before all are."""
 
 
-@kernel
+@inlined
 def solve(w, c, i, kinds, k, contacts, eo, go, length, warm):
     """Solve the program in the contact table and the loads; forces to the table, multipliers to the workspace.
 
@@ -85,28 +85,27 @@ def solve(w, c, i, kinds, k, contacts, eo, go, length, warm):
     if not _prepare(w, c, i, kinds, k, contacts, eo, go, length):
         return FAILED, 0
     edges = i[EDGE_ROWS]
-    mask = warm & ((1 << edges) - 1)
-    for _ in range(GUESSES):
-        if _attempt(w, c, i, mask, contacts, eo, go, length) <= EXACT:
-            _multipliers(w, i, length)
-            return SOLVED, mask
-        if i[NEXT] == mask:
-            break
-        mask = i[NEXT]
-    best, least = 0, 1e300
-    for mask in range(1 << edges):
+    mask, tries, sweep, best, least = warm & ((1 << edges) - 1), 0, -1, 0, 1e300
+    while True:  # one call for guesses, for all sets and for the best of these: it is compiled into its place
         violation = _attempt(w, c, i, mask, contacts, eo, go, length)
-        if violation <= EXACT:
-            _multipliers(w, i, length)
-            return SOLVED, mask
-        if violation < least:
+        if violation <= EXACT or sweep == 1 << edges:
+            break
+        if sweep < 0:
+            tries += 1
+            if tries < GUESSES and i[NEXT] != mask:
+                mask = i[NEXT]
+                continue
+        elif violation < least:
             best, least = mask, violation
-    _attempt(w, c, i, best, contacts, eo, go, length)
+        sweep += 1
+        mask = sweep if sweep < 1 << edges else best
     _multipliers(w, i, length)
-    return (INACCURATE if least <= ROUGH else INFEASIBLE), best
+    if violation <= EXACT:
+        return SOLVED, mask
+    return (INACCURATE if violation <= ROUGH else INFEASIBLE), mask
 
 
-@kernel
+@inlined
 def _prepare(w, c, i, kinds, k, contacts, eo, go, length):
     """Write unknowns and rows, and the basis of the balance. Returns False where a figure is not finite."""
     n, edges, total = 0, 0, 0.0
@@ -171,7 +170,7 @@ def _prepare(w, c, i, kinds, k, contacts, eo, go, length):
     return total - total == 0.0
 
 
-@kernel
+@inlined
 def _extend(w, n, rank, row):
     """Add a row of the workspace to the basis; False where it depends on those that are in it."""
     size = 0.0
@@ -206,7 +205,7 @@ def _extend(w, n, rank, row):
     return True
 
 
-@kernel
+@inlined
 def respond(w, n, rank, go, target, rhs, e, g, z):
     """g and z of the program with these active rows; arguments are rows of the workspace.
 
@@ -242,7 +241,7 @@ def respond(w, n, rank, go, target, rhs, e, g, z):
         w[z, r] /= w[L + r, 3 + r]
 
 
-@kernel
+@inlined
 def _project_slack(w, n, rank):
     """Orthonormal columns of (Mᵀ; 1), n parts to M and 3 to L, and beside these the triangle that makes it of them."""
     for r in range(3):
@@ -289,7 +288,7 @@ def _project_slack(w, n, rank):
             w[L + r, j] /= root
 
 
-@kernel
+@inlined
 def _attempt(w, c, i, mask, contacts, eo, go, length):
     """Solve with the edges of ``mask`` active; returns the largest violation, relative; the next guess goes to NEXT."""
     n, edges, rank = i[UNKNOWNS], i[EDGE_ROWS], i[EQUAL_RANK]
@@ -375,7 +374,7 @@ def _attempt(w, c, i, mask, contacts, eo, go, length):
     return violation
 
 
-@kernel
+@inlined
 def _multipliers(w, i, length):
     """Multipliers of the two balances in the units of the balances."""
     for r in range(3):

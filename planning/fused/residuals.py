@@ -1,7 +1,8 @@
 """The losses of a step and their derivatives, compiled; `planning.losses` says what they are and why.
 
 ``level`` is 0 for the loss alone, 1 with its gradient, 2 with the Gauss–Newton block as well. Derivatives are with the
-variables of the step, times their scale, and 0 where a variable is not free.
+variables of the step, times their scale, and 0 where a variable is not free. With level 2 each residual has its own.
+With level 1 what comes by forces, slack, wrench and hand is summed by these, for `planning.fused.adjoint` to go on.
 """
 
 from __future__ import annotations
@@ -11,6 +12,10 @@ from math import acos, atan2, ceil, cos, inf, log, log1p, pi, sin, sqrt
 from planning.fused.layout import (
     ANGLE,
     BASE,
+    BY_EE,
+    BY_F,
+    BY_WRENCH,
+    BY_Z,
     C_AX,
     C_AY,
     C_TX,
@@ -78,7 +83,7 @@ from planning.fused.layout import (
     Y,
     Z,
 )
-from planning.fused.sources import kernel
+from planning.fused.sources import inlined, kernel
 
 MILLIMETRE = 1e-3
 NO_FORCE = 1e-9
@@ -87,15 +92,13 @@ NO_FORCE = 1e-9
 
 @kernel
 def _add(w, gradient, hessian, k, r, level):
-    """Enter a residual whose derivatives are in row RES; returns its square."""
-    if level:
+    """Enter a residual, with level 2 by its derivatives, in row RES; returns its square."""
+    if level == 2:
         for j in range(5):
-            gradient[k, j] += 2 * r * w[RES, j]
-        if level == 2:
-            for j in range(5):
-                d = 2 * w[RES, j]
-                for m in range(5):
-                    hessian[k, j, m] += d * w[RES, m]
+            d = 2 * w[RES, j]
+            gradient[k, j] += r * d
+            for m in range(5):
+                hessian[k, j, m] += d * w[RES, m]
     return r * r
 
 
@@ -115,9 +118,12 @@ def _barrier(squared):
     return -0.1 * log1p(-squared) if squared < 1 else inf
 
 
-@kernel
+@inlined
 def of_step(w, c, kinds, free, steps, fixed, flags, gradient, hessian, k, level):
     """Return the step's loss without smoothness; add to ``gradient`` (5,) and ``hessian`` (5, 5)."""
+    if level == 1:
+        for r in range(4):
+            w[BY_F, r], w[BY_Z, r], w[BY_WRENCH, r], w[BY_EE, r] = 0.0, 0.0, 0.0, 0.0
     total = _of_angle(w, free, steps, fixed, gradient, hessian, k, level)
     if total == inf:
         return inf
@@ -125,7 +131,9 @@ def of_step(w, c, kinds, free, steps, fixed, flags, gradient, hessian, k, level)
     if flags[PAPER] and fixed[W_SLACK] > 0:
         for r in range(3):
             factor = fixed[W_SLACK] / w[ROOT_SLACK, r] / (fixed[RHO] if r == 2 else 1.0)
-            if level:
+            if level == 1:
+                w[BY_Z, r] = 2 * w[Z, r] * factor * factor
+            elif level == 2:
                 for j in range(5):
                     w[RES, j] = w[D_Z + j, r] * factor if free[k, j] else 0.0
             total += _add(w, gradient, hessian, k, w[Z, r] * factor, level)
@@ -136,7 +144,7 @@ def of_step(w, c, kinds, free, steps, fixed, flags, gradient, hessian, k, level)
     return total
 
 
-@kernel
+@inlined
 def _of_angle(w, free, steps, fixed, gradient, hessian, k, level):
     """Penetration and tracking."""
     total = 0.0
@@ -157,7 +165,7 @@ def _of_angle(w, free, steps, fixed, gradient, hessian, k, level):
     return total
 
 
-@kernel
+@inlined
 def _of_forces(w, c, kinds, steps, fixed, flags, gradient, hessian, k, level):
     """Cone, pull and contact force."""
     total, n = 0.0, flags[OBJECTS]
@@ -171,17 +179,28 @@ def _of_forces(w, c, kinds, steps, fixed, flags, gradient, hessian, k, level):
             if level:
                 cube = fixed[W_CONE] / (size * size * size)
                 by_n, by_t = -(f_t * f_t + NO_FORCE * NO_FORCE) * cube, f_n * f_t * cube
-                for j in range(5):
-                    w[RES, j] = by_n * w[row, j] + by_t * w[row + 1, j]
+                if level == 1:
+                    d = 2 * fixed[W_CONE] * (1 - f_n / size)
+                    w[BY_F, 2 * at] += d * by_n
+                    w[BY_F, 2 * at + 1] += d * by_t
+                else:
+                    for j in range(5):
+                        w[RES, j] = by_n * w[row, j] + by_t * w[row + 1, j]
             total += _add(w, gradient, hessian, k, fixed[W_CONE] * (1 - f_n / size), level)
         if f_n < 0 and kinds[k, at] in (OPEN, RAY) and fixed[W_PULL] > 0:
-            if level:
+            if level == 1:
+                w[BY_F, 2 * at] += 2 * fixed[W_PULL] * fixed[W_PULL] * f_n
+            elif level == 2:
                 for j in range(5):
                     w[RES, j] = fixed[W_PULL] * w[row, j]
             total += _add(w, gradient, hessian, k, fixed[W_PULL] * f_n, level)
     if fixed[W_FORCE] > 0:
         for side in range(2):
-            if level:
+            if level == 1:
+                d = 2 * fixed[W_FORCE] * fixed[W_FORCE] * (sum_n if side == 0 else sum_t)
+                for at in range(n):
+                    w[BY_F, 2 * at + side] += d
+            elif level == 2:
                 for j in range(5):
                     d = w[DF + side, j]
                     if n == 2:
@@ -210,7 +229,7 @@ def _sensor_and_hand(w, c, free, fixed, flags, where, k, level):
         px, py, turn = _comply(fixed, w[SENSED, 0], w[SENSED, 1], w[SENSED, 2])
     w[EE, 0], w[EE, 1] = gx + co * px - si * py, gy + si * px + co * py
     w[EE, 2] = w[POSE, 2] + fixed[GRASP + 2] + turn
-    if not level:
+    if level < 2:
         return
     for j in range(5):
         if not free[k, j]:
@@ -296,8 +315,11 @@ def _of_hand(w, fixed, flags, gradient, hessian, k, level):
             u = (w[EE, r] - fixed[WORK_MIDDLE + r]) / half
             if level and u * u < 1:
                 slope = fixed[W_WORKSPACE] * 0.2 * u / (1 - u * u) / half
-                for j in range(5):
-                    w[RES, j] = slope * w[DEE + r, j]
+                if level == 1:
+                    w[BY_EE, r] += 2 * fixed[W_WORKSPACE] * _barrier(u * u) * slope
+                else:
+                    for j in range(5):
+                        w[RES, j] = slope * w[DEE + r, j]
             total += _add(w, gradient, hessian, k, fixed[W_WORKSPACE] * _barrier(u * u), level)
     if flags[JOINTS]:
         if not _bend(w, fixed, level):
@@ -306,9 +328,14 @@ def _of_hand(w, fixed, flags, gradient, hessian, k, level):
             u = w[DQ + r, 3]
             if level and u * u < 1:
                 slope = fixed[W_JOINTS] * 0.2 * u / (1 - u * u) / fixed[JOINT_HALF + r]
-                for j in range(5):
-                    d = w[DQ + r, 0] * w[DEE, j] + w[DQ + r, 1] * w[DEE + 1, j] + w[DQ + r, 2] * w[DEE + 2, j]
-                    w[RES, j] = slope * d
+                if level == 1:
+                    d = 2 * fixed[W_JOINTS] * _barrier(u * u) * slope
+                    for j in range(3):
+                        w[BY_EE, j] += d * w[DQ + r, j]
+                else:
+                    for j in range(5):
+                        d = w[DQ + r, 0] * w[DEE, j] + w[DQ + r, 1] * w[DEE + 1, j] + w[DQ + r, 2] * w[DEE + 2, j]
+                        w[RES, j] = slope * d
             total += _add(w, gradient, hessian, k, fixed[W_JOINTS] * _barrier(u * u), level)
     if flags[MOST_F]:
         most = fixed[MOST_FORCE]
@@ -316,15 +343,23 @@ def _of_hand(w, fixed, flags, gradient, hessian, k, level):
         squared = wx * wx + wy * wy
         if level and squared < 1:
             slope = fixed[W_SENSOR] * 0.2 / (1 - squared) / most
-            for j in range(5):
-                w[RES, j] = slope * (wx * w[DW, j] + wy * w[DW + 1, j])
+            if level == 1:
+                d = 2 * fixed[W_SENSOR] * _barrier(squared) * slope
+                w[BY_WRENCH, 0] += d * wx
+                w[BY_WRENCH, 1] += d * wy
+            else:
+                for j in range(5):
+                    w[RES, j] = slope * (wx * w[DW, j] + wy * w[DW + 1, j])
         total += _add(w, gradient, hessian, k, fixed[W_SENSOR] * _barrier(squared), level)
     if flags[MOST_T]:
         u = w[WRENCH, 2] / fixed[MOST_TORQUE]
         if level and u * u < 1:
             slope = fixed[W_SENSOR] * 0.2 * u / (1 - u * u) / fixed[MOST_TORQUE]
-            for j in range(5):
-                w[RES, j] = slope * w[DW + 2, j]
+            if level == 1:
+                w[BY_WRENCH, 2] += 2 * fixed[W_SENSOR] * _barrier(u * u) * slope
+            else:
+                for j in range(5):
+                    w[RES, j] = slope * w[DW + 2, j]
         total += _add(w, gradient, hessian, k, fixed[W_SENSOR] * _barrier(u * u), level)
     return total
 

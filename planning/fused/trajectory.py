@@ -6,6 +6,7 @@ from math import inf, isfinite, sqrt
 
 import numpy as np
 
+from planning.fused.adjoint import pull_back
 from planning.fused.geometry import differentiate, forces_in_world, place
 from planning.fused.layout import (
     COLUMNS,
@@ -28,13 +29,13 @@ from planning.fused.layout import (
 )
 from planning.fused.program import INFEASIBLE, solve
 from planning.fused.residuals import MILLIMETRE, of_step
-from planning.fused.sources import entry, fingerprint, kernel
+from planning.fused.sources import entry, fingerprint, inlined, kernel
 
 VALUE, GRADIENT, QUADRATIC, ADAM = range(4)
 """Levels: what `run` is asked for."""
 
 
-@kernel
+@inlined
 def _trajectory(z, kinds, steps, fixed, flags, free, start, warm, w, c, i, pose, gradient, diagonal, below, level):
     """Loss of one z (K, 5); derivatives are overwritten, ``pose`` (K, 8) is room for the go's poses and theirs."""
     K, contacts, total = len(z), flags[OBJECTS] + flags[GROUNDS], 0.0
@@ -54,11 +55,13 @@ def _trajectory(z, kinds, steps, fixed, flags, free, start, warm, w, c, i, pose,
             warm[k] = 0
             return inf
         forces_in_world(c, flags[OBJECTS])
-        if level:
+        if level == 2:
             differentiate(w, c, i, kinds, free, steps, fixed, flags, k)
         total += of_step(w, c, kinds, free, steps, fixed, flags, gradient, diagonal, k, level)
         if not total < inf:
             return inf
+        if level == 1:
+            pull_back(w, c, i, kinds, free, steps, fixed, flags, gradient, k)
         for r in range(3):
             pose[k, r] = w[POSE, r]
         if level:

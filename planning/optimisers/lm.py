@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from math import isfinite
 from typing import ClassVar
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from mechanics.readings import Array
 from planning.optimisers.base import Objective, Optimiser, Optimum, Quadratic, register
@@ -18,6 +20,8 @@ from planning.optimisers.checks import checked_start, require_finite
 SMALLEST, LARGEST = 1e-7, 1e16
 #: trials that the model may misjudge before it asks for the curvature
 MISJUDGED = 2
+#: how far from 1 the gain ratio may be before the damping is mended, and what that multiplies it by at most
+RIGHT, MOST_GROWTH = 0.25, 10.0
 #: step of the differences that make a Hessian [units of z], and how far its entries may exceed Gauss–Newton's
 DIFFERENCE, JUMP = 1e-5, 30.0
 #: damping that is handed on at most: what stalled one problem need not slow down the next
@@ -48,7 +52,9 @@ class Warm:
 class LevenbergMarquardt(Optimiser):
     """Steps δ of (H + λ diag(JᵀJ)) δ = −g, with the damping λ set by the gain ratio (Nielsen 1999).
 
-    A trial is taken where the loss falls; λ then shrinks by up to 3 as the model proves right. Where it does not fall
+    A trial is taken where the loss falls; λ then shrinks by up to 3 as the model proves right. Where that promised more
+    than a quarter too much or too little, λ does not fall below what gives it the loss's curvature along the step, by
+    the two gradients: in a flat valley that is the secant method at no further query. Where the loss does not fall
     (the gradient jumps where the active set of a program changes) or is not finite (behind a barrier), λ grows by 2, 4,
     8 … and the step is tried again.
 
@@ -57,7 +63,8 @@ class LevenbergMarquardt(Optimiser):
     grasped object about its contact at all steps alike costs next to nothing; in so flat a valley it is all there is.
 
     ``iterations`` is the most trials; the curve has the loss of the point where it stands after each. A query is a
-    trial or one of the gradients of a curvature, of which there are at most 3 D.
+    trial or one of the gradients of a curvature: three for each variable that is tied to its neighbours, as a rule the
+    angle, and one for each other.
 
     It has converged where the model promises less than ``loss_tolerance`` of the loss, at this λ or without damping;
     where the gradient's largest component is below ``gradient_tolerance`` of what it was at the start; or where the
@@ -93,16 +100,15 @@ class LevenbergMarquardt(Optimiser):
         damping = self.damping if warm.damping is None else warm.damping
         growth, curve, queries, misjudged = 2.0, [model.value], 1, 0
         rest = warm.curvature
-        if rest is None or rest.diagonal.shape != model.diagonal.shape:
-            rest = Curvature(np.zeros_like(model.diagonal), np.zeros_like(model.below))
+        if rest is not None and rest.diagonal.shape != model.diagonal.shape:
+            rest = None
+        H = _hessian(model, rest)
         known_here = False  # whether ``rest`` is of this z
         while True:
             if _largest(model.gradient, free) <= flat:
                 status = "converged"
                 break
-            z_trial, promised, length, damping = _trial(
-                z, model.gradient, model.diagonal, model.below, rest.diagonal, rest.below, free, damping
-            )
+            z_trial, promised, length, bend, damping = _trial(z, model.gradient, model.diagonal, *H, free, damping)
             if damping > LARGEST:
                 status = "stalled"
                 break
@@ -120,10 +126,12 @@ class LevenbergMarquardt(Optimiser):
                 break
             trial = objective.quadratic(z_trial)
             queries += 1
-            gain = (model.value - trial.value) / promised if _usable(trial) else 0.0
+            gain = (model.value - trial.value) / promised if _usable(trial, free) else 0.0
             if gain > 0:
-                z, model, known_here = z_trial, trial, False
-                damping, growth = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), SMALLEST), 2.0
+                least = 0.0 if abs(gain - 1) < RIGHT else _secant(z, z_trial, trial.gradient, bend)
+                damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3, min(least, MOST_GROWTH))
+                damping, growth = max(damping, SMALLEST), 2.0
+                z, model, known_here, H = z_trial, trial, False, _hessian(trial, rest)
             else:
                 damping, growth = damping * growth, 2 * growth
             curve.append(model.value)
@@ -132,7 +140,7 @@ class LevenbergMarquardt(Optimiser):
                 rest, asked = curvature(objective, z, model)
                 queries += asked
                 misjudged, known_here = MISJUDGED - 1, True
-                warm.curvature = rest
+                warm.curvature, H = rest, _hessian(model, rest)
         warm.damping = min(damping, LARGEST_HANDED_ON)
         return Optimum(z, model.value, np.array(curve), queries, time.perf_counter() - began, status)
 
@@ -140,82 +148,127 @@ class LevenbergMarquardt(Optimiser):
 def curvature(objective: Objective, z: Array, model: Quadratic) -> tuple[Curvature, int]:
     """Return the exact Hessian less Gauss–Newton's ``model`` of it at ``z`` (K, D), and how many gradients that took.
 
-    Forward differences of the gradient. As only neighbours are coupled, every third step is moved at once: 3 D
-    gradients whatever K. Where an active set changes between the two points the difference is a jump over a small
-    number: a column much larger than any of Gauss–Newton's is taken to be Gauss–Newton's.
+    Forward differences of the gradient, of many columns at once (Curtis, Powell, Reid 1974). A variable that is tied to
+    the neighbouring steps, which Gauss–Newton's blocks tell, is moved at every third step; any other at all of them:
+    between D and 3 D gradients whatever K. Where an active set changes between the two points the difference is a jump
+    over a small number: a column much larger than any of Gauss–Newton's is taken to be Gauss–Newton's.
     """
     K, D = z.shape
-    free = objective.free
+    free = np.ascontiguousarray(objective.free, dtype=np.bool_)
     diagonal, below = model.diagonal.copy(), model.below.copy()
     above = np.swapaxes(below, 1, 2).copy()
-    most, asked = JUMP * max(float(np.abs(diagonal).max()), float(np.abs(below).max(initial=0.0))), 0
-    for first in range(min(3, K)):
-        for i in range(D):
-            moved = np.arange(first, K, 3)
-            moved = moved[free[moved, i]]
-            if not len(moved):
+    most = JUMP * max(float(np.abs(diagonal).max()), float(np.abs(below).max(initial=0.0)))
+    tied = np.any(below, axis=(0, 1)) | np.any(below, axis=(0, 2))
+    asked = 0
+    for i in range(D):
+        apart = 3 if tied[i] else 1
+        for first in range(min(apart, K)):
+            if not free[first::apart, i].any():
                 continue
             there = z.copy()
-            there[moved, i] += DIFFERENCE
+            there[first::apart, i] += DIFFERENCE * free[first::apart, i]
             value, gradient = objective.gradient(there)
             asked += 1
-            if not (np.isfinite(value) and np.isfinite(gradient).all()):
-                continue
-            change = np.where(free, gradient - model.gradient, 0.0) / DIFFERENCE
-            size = np.pad(np.abs(change).max(axis=1), 1)
-            moved = moved[np.max([size[:-2], size[1:-1], size[2:]], axis=0)[moved] < most]
-            lower, upper = moved[moved < K - 1], moved[moved > 0]
-            diagonal[moved, :, i] = change[moved]
-            below[lower, :, i] = change[lower + 1]
-            above[upper - 1, :, i] = change[upper - 1]
+            if np.isfinite(value) and np.isfinite(gradient).all():
+                _enter(gradient, model.gradient, free, first, apart, i, most, diagonal, below, above)
     diagonal = 0.5 * (diagonal + np.swapaxes(diagonal, 1, 2))
     below = 0.5 * (below + np.swapaxes(above, 1, 2))
     return Curvature(diagonal - model.diagonal, below - model.below), asked
 
 
-def _usable(model: Quadratic) -> bool:
+@njit(cache=True, fastmath=False, error_model="numpy")
+def _enter(there, here, free, first, apart, i, most, diagonal, below, above):
+    """Write the columns that moving variable i at steps ``first``, ``first`` + ``apart``, … changed the gradient by."""
+    K, D = here.shape
+    reach = 1 if apart > 1 else 0
+    for k in range(first, K, apart):
+        if not free[k, i]:
+            continue
+        size = 0.0
+        for n in range(max(k - reach, 0), min(k + reach, K - 1) + 1):
+            for j in range(D):
+                if free[n, j]:
+                    size = max(size, abs(there[n, j] - here[n, j]))
+        if not size < most * DIFFERENCE:
+            continue
+        for j in range(D):
+            if free[k, j]:
+                diagonal[k, j, i] = (there[k, j] - here[k, j]) / DIFFERENCE
+            if reach and k < K - 1 and free[k + 1, j]:
+                below[k, j, i] = (there[k + 1, j] - here[k + 1, j]) / DIFFERENCE
+            if reach and k > 0 and free[k - 1, j]:
+                above[k - 1, j, i] = (there[k - 1, j] - here[k - 1, j]) / DIFFERENCE
+
+
+def _hessian(model: Quadratic, rest: Curvature | None) -> tuple[Array, Array]:
+    """Gauss–Newton's blocks, with what they leave out where that is known."""
+    if rest is None:
+        return model.diagonal, model.below
+    return model.diagonal + rest.diagonal, model.below + rest.below
+
+
+def _usable(model: Quadratic, free: NDArray[np.bool_]) -> bool:
     """Whether loss and gradient are finite."""
-    return bool(np.isfinite(model.value) and np.isfinite(model.gradient).all())
+    return isfinite(model.value) and isfinite(_largest(model.gradient, free))
 
 
-@njit(cache=True, fastmath=False)
+@njit(cache=True, fastmath=False, error_model="numpy")
 def _largest(gradient, free):
-    """The largest magnitude (K, D) → float among the free variables."""
+    """The largest magnitude (K, D) → float among the free variables; NaN where one is none."""
     largest = 0.0
     for k in range(gradient.shape[0]):
         for i in range(gradient.shape[1]):
             if free[k, i]:
+                if np.isnan(gradient[k, i]):
+                    return np.nan
                 largest = max(largest, abs(gradient[k, i]))
     return largest
 
 
-@njit(cache=True, fastmath=False)
-def _trial(z, gradient, diagonal, below, rest_diagonal, rest_below, free, damping):
-    """The damped step's end (K, D), the fall of the loss that the model promises, the step's largest part, the damping.
+@njit(cache=True, fastmath=False, error_model="numpy")
+def _secant(z, z_trial, gradient, bend):
+    """By how much to multiply λ, that H + λ diag(JᵀJ) has along the step δ the curvature that the loss has there.
 
-    Damping grows until H + λ diag(JᵀJ) is positive definite. A variable on which no residual depends has no gradient
-    either; a small floor under the diagonal keeps it where it is.
+    The model's gradient at δ is −λ diag(JᵀJ) δ. Along δ that is −``bend``, δᵀ``gradient`` with the loss's own; without
+    the difference the step would have ended where the loss's is zero.
+    """
+    along = 0.0
+    for k in range(z.shape[0]):
+        for i in range(z.shape[1]):
+            along += gradient[k, i] * (z_trial[k, i] - z[k, i])
+    return 1.0 + along / bend
+
+
+@njit(cache=True, fastmath=False, error_model="numpy")
+def _trial(z, gradient, scale, diagonal, below, free, damping):
+    """The damped step's end z + δ (K, D), the fall of the loss that the model promises, δ's largest part, how much of
+    the curvature along δ is damping, λ δᵀ diag(JᵀJ) δ, and the damping λ.
+
+    ``diagonal`` and ``below`` are H's blocks; the damping is in units of the diagonals of ``scale`` (K, D, D), which is
+    2 JᵀJ, and grows until the damped matrix is positive definite. A variable on which no residual depends has no
+    gradient either; a small floor under the diagonal keeps it where it is.
     """
     K, D = z.shape
     most = 0.0
     for k in range(K):
         for i in range(D):
             if free[k, i]:
-                most = max(most, diagonal[k, i, i])
-    full, full_below = diagonal + rest_diagonal, below + rest_below
+                most = max(most, scale[k, i, i])
     added, step, down = np.empty((K, D)), np.empty((K, D)), -gradient
     while damping <= LARGEST:
         for k in range(K):
             for i in range(D):
-                added[k, i] = damping * max(diagonal[k, i, i], 1e-8 * most)
-        if damped_solve(full, full_below, down, free, added, step):
-            promised, length = 0.0, 0.0
+                added[k, i] = damping * max(scale[k, i, i], 1e-8 * most)
+        if damped_solve(diagonal, below, down, free, added, step):
+            promised, length, bend = 0.0, 0.0, 0.0
             for k in range(K):
                 for i in range(D):
                     if free[k, i]:
                         # −gᵀδ − ½ δᵀHδ with H δ = −g − λ diag(JᵀJ) δ
+                        bend += added[k, i] * step[k, i] ** 2
                         promised += 0.5 * step[k, i] * (added[k, i] * step[k, i] - gradient[k, i])
                         length = max(length, abs(step[k, i]))
-            return z + step, promised, length, damping
+                    step[k, i] += z[k, i]
+            return step, promised, length, bend, damping
         damping *= 2.0
-    return z, 0.0, 0.0, damping
+    return z, 0.0, 0.0, 0.0, damping

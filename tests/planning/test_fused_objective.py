@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -32,8 +32,13 @@ def test_loss_gradient_and_model_are_those_of_torch(kind):
     for seed, limits in enumerate((False, True)):
         problem = problem_of(kind, seed, limits=limits)
         z = random_z(problem, np.random.default_rng(100 + seed))
-        fused, expected = FusedObjective(problem).quadratic(z), TorchObjective(problem).quadratic(z)
+        objective = FusedObjective(problem)
+        fused, expected = objective.quadratic(z), TorchObjective(problem).quadratic(z)
         assert np.isfinite(expected.value)
+        value, gradient = objective.gradient(z)
+        assert value == pytest.approx(expected.value, rel=1e-9)
+        close = 1e-7 * max(1.0, np.abs(expected.gradient).max())
+        np.testing.assert_allclose(gradient, expected.gradient, rtol=0, atol=close)
         assert fused.value == pytest.approx(expected.value, rel=1e-9)
         for name in ("gradient", "diagonal", "below"):
             made, due = getattr(fused, name), getattr(expected, name)
@@ -55,6 +60,40 @@ def test_the_gradient_is_that_of_central_differences(kind):
     expected[tuple(at.T)] = (values[::2] - values[1::2]) / (2 * h)
     assert np.isfinite(value)
     np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-5 * max(1.0, np.abs(gradient).max()))
+
+
+@pytest.mark.parametrize("form", Form)
+@pytest.mark.parametrize("loss", [item.name for item in fields(LossWeights)])
+def test_each_loss_alone_has_the_gradient_of_torch(form, loss):
+    weights = LossWeights(**{item.name: float(item.name == loss) for item in fields(LossWeights)})
+    gradients = []
+    for two_bodies, touch in (
+        (True, Touch.CORNER_ON_FACE),
+        (True, Touch.FACE_ON_CORNER),
+        (False, Touch.FACE_ON_CORNER),
+    ):
+        problem = problem_of((form, two_bodies, touch, Mode.STICK), 11, limits=True)
+        problem = replace(problem, weights=weights)
+        z = random_z(problem, np.random.default_rng(12), 2.0)
+        (value, gradient), (due, expected) = FusedObjective(problem).gradient(z), TorchObjective(problem).gradient(z)
+        assert value == pytest.approx(due, rel=1e-9, abs=1e-12)
+        np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-7 * np.abs(expected).max() + 1e-16)
+        gradients.append(np.abs(expected).max())
+    assert (max(gradients) > 1e-8) == ((form, loss) != (Form.CLOSED, "slack"))  # which has none
+
+
+def test_a_displacement_that_is_not_free_stays_at_the_nominal_one():
+    """The paper form's nominal displacement balances the go; it is found only where it is kept."""
+    problem = pivoting_pentagon(Form.PAPER, steps=6)
+    free = np.array(problem.free)
+    free[2, 3] = free[4, 2:] = False
+    kept = replace(problem, free=free)
+    z = random_z(kept, np.random.default_rng(4))
+    z[~free] += 5.0
+    (value, gradient), (due, expected) = FusedObjective(kept).gradient(z), TorchObjective(kept).gradient(z)
+    assert value == pytest.approx(due, rel=1e-9)
+    np.testing.assert_allclose(gradient, expected, rtol=0, atol=1e-7 * max(1.0, np.abs(expected).max()))
+    np.testing.assert_array_equal(FusedObjective(kept).start, kept.start)
 
 
 @pytest.mark.parametrize("form", Form)

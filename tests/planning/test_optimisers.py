@@ -233,6 +233,68 @@ def test_what_gauss_newton_leaves_out_is_the_exact_hessians_by_central_differenc
     assert asked == 3
 
 
+def tied_and_alone(K=8):
+    """Two variables a step, (z, u): z is tied to its neighbours by 3 sin Δz and to u by 2 z u, u to nothing else."""
+    ahead = np.diff(np.eye(K), axis=0)
+
+    def residuals(z):
+        z, u = z.T
+        return np.concatenate([3 * np.sin(np.diff(z)), 2 * z * u - 5, np.exp(u) + 2])
+
+    def jacobian(z):
+        z, u = z.T
+        J = np.zeros((3 * K - 1, K, 2))
+        J[: K - 1, :, 0] = 3 * np.cos(np.diff(z))[:, None] * ahead
+        J[K - 1 : 2 * K - 1, :, 0], J[K - 1 : 2 * K - 1, :, 1] = 2 * np.diag(u), 2 * np.diag(z)
+        J[2 * K - 1 :, :, 1] = np.diag(np.exp(u))
+        return J.reshape(3 * K - 1, 2 * K)
+
+    start = np.random.default_rng(4).uniform(0.2, 1.2, (K, 2))
+    return LeastSquares(start, residuals, jacobian)
+
+
+@pytest.mark.parametrize("K", [1, 2, 3, 8])
+def test_what_is_tied_to_no_neighbour_is_asked_for_at_all_steps_at_once(K):
+    made = tied_and_alone(K)
+    z, at = made.start, np.arange(K)
+    model = made.quadratic(z)
+    rest, asked = curvature(made, z, model)
+    assert asked == min(K, 3) + 1
+    h, exact = 1e-5, np.zeros((K, 2, K, 2))
+    for k, i in np.ndindex(K, 2):
+        step = np.zeros((K, 2))
+        step[k, i] = h
+        exact[k, i] = (made.gradient(z + step)[1] - made.gradient(z - step)[1]) / (2 * h)
+    assert (model.diagonal + rest.diagonal) == pytest.approx(exact[at, :, at, :], rel=1e-3, abs=1e-2)
+    assert (model.below + rest.below) == pytest.approx(exact[at[1:], :, at[:-1], :], rel=1e-3, abs=1e-2)
+    assert np.abs(rest.diagonal).max() > 1
+
+
+def test_what_is_not_free_is_not_asked_for():
+    made = tied_and_alone()
+    made.free[:, 1] = False
+    assert curvature(made, made.start, made.quadratic(made.start))[1] == 3
+    made.free[:] = [False, True]
+    assert curvature(made, made.start, made.quadratic(made.start))[1] == 1
+
+
+@pytest.mark.parametrize("missing", [0.6, 0.8, 0.95])
+def test_in_a_valley_the_damping_becomes_the_curvature_that_gauss_newton_lacks(missing):
+    """Σ z² + (c + b z²)² curves as 2 + 4 b c at its optimum, zero, of which Gauss–Newton sees 2: λ is to be 2 b c."""
+    K, c = 5, 3.0
+    b = missing / (2 * c)
+    made = LeastSquares(
+        np.linspace(0.02, 0.1, K)[:, None],
+        lambda z: np.concatenate([z.ravel(), c + b * z.ravel() ** 2]),
+        lambda z: np.vstack([np.eye(K), np.diag(2 * b * z.ravel())]),
+    )
+    warm = Warm()
+    found = run(LevenbergMarquardt(exact=False, warm=warm, loss_tolerance=1e-12), made)
+    assert found.z == pytest.approx(np.zeros((K, 1)), abs=1e-5)
+    assert warm.damping == pytest.approx(missing, rel=0.05)
+    assert found.queries <= 8
+
+
 def test_with_large_residuals_the_curvature_saves_trials_and_both_arrive():
     made = large_residual()
     exact, plain = (run(LevenbergMarquardt(exact=on, iterations=500), made) for on in (True, False))
