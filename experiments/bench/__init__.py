@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -15,6 +17,8 @@ from experiments.run_folder import write_json
 from mechanics.yaml_input import InputError, Problem, nearest, one_of
 
 Horizons = Sequence[int] | None
+#: columns of a table that goes to a file or a pipe
+FILE_WIDTH = 160
 
 
 def _sim(runs: int, _horizons: Horizons) -> Iterator[figures.Figure]:
@@ -70,7 +74,7 @@ def main(
         for figure in BENCHMARKS[name](runs, horizons):
             measured.append(figure)
             said.print(f"{figure.name}: {figure.median:.3g} {figure.unit}", highlight=False, markup=False)
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else FILE_WIDTH)
     console.print(figures.table(f"bench {name}", measured, targets))
     if name in TABLES:
         console.print(TABLES[name](measured))

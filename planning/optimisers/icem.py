@@ -47,7 +47,7 @@ class ICEM(Optimiser):
     name: ClassVar[str] = "icem"
     iterations: int = 50
     samples: int = 20
-    sigma: float | tuple[float, ...] = 1.0
+    sigma: float | tuple[float, ...] = 0.1
     beta: float = 3.0
     spread: float = 1.0
     elites: int | None = None

@@ -66,7 +66,7 @@ class MPPI(Optimiser):
     name: ClassVar[str] = "mppi"
     iterations: int = 10
     samples: int = 100
-    sigma: float | tuple[float, ...] = 1.0
+    sigma: float | tuple[float, ...] = 0.1
     beta: float = 3.0
     temperature: float | None = None
     effective: float = 0.1

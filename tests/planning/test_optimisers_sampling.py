@@ -109,7 +109,7 @@ def test_where_losses_tie_the_mean_stays_and_a_signed_cost_of_the_noise_would_mo
     moved, signed = [], []
     for seed in range(100):
         problem, batches = watched(level)
-        run(MPPI(1, 100, beta=0.0, temperature=1.0, elite=False, shrink=1.0), problem, seed)
+        run(MPPI(1, 100, sigma=1.0, beta=0.0, temperature=1.0, elite=False, shrink=1.0), problem, seed)
         moved.append((batches[-1][0] - level.start).ravel())
         noise = (batches[-2][1:] - level.start).reshape(98, 6)
         omega = weights(noise @ level.start.ravel(), 1.0, 0.1)
@@ -121,7 +121,7 @@ def test_where_losses_tie_the_mean_stays_and_a_signed_cost_of_the_noise_would_mo
 
 def test_the_paths_of_pytorch_mppi_bias_toward_zero_are_not_ours():
     """The same task, moved by 5: the reference ends at 11.4 ± 0.5 instead of 1.5 ± 0.1, ours at the same."""
-    optimiser = MPPI(10, 100, beta=0.0, temperature=0.5, elite=False, shrink=1.0)
+    optimiser = MPPI(10, 100, sigma=1.0, beta=0.0, temperature=0.5, elite=False, shrink=1.0)
     here, there = (run(optimiser, separable(K=5, D=2, offset=offset)).value for offset in (0.0, 5.0))
     assert here == pytest.approx(there, rel=1e-9)
 
@@ -129,7 +129,7 @@ def test_the_paths_of_pytorch_mppi_bias_toward_zero_are_not_ours():
 @pytest.mark.parametrize(("iterations", "batches"), [(1, [99, 1]), (10, [100] * 9 + [99, 1])])
 def test_mppis_samples_come_in_one_batch_per_iteration_and_the_last_mean_alone(iterations, batches):
     problem = tracking()
-    found = run(MPPI(iterations, 100), problem)
+    found = run(MPPI(iterations, 100, sigma=1.0), problem)
     assert problem.batches == batches
     assert found.queries == 100 * iterations
     assert len(found.curve) == iterations and (np.diff(found.curve) <= 0).all()
@@ -137,7 +137,7 @@ def test_mppis_samples_come_in_one_batch_per_iteration_and_the_last_mean_alone(i
 
 def test_a_spread_draws_a_scale_for_each_sample():
     problem, batches = watched(tracking(K=400, D=1))
-    run(MPPI(1, 3000, beta=0.0, spread=20.0), problem)
+    run(MPPI(1, 3000, sigma=1.0, beta=0.0, spread=20.0), problem)
     scale = np.log(batches[0][1:].std(axis=(1, 2)))
     assert (scale.min(), scale.mean(), scale.max()) == pytest.approx((-np.log(20), -np.log(20) / 2, 0.0), abs=0.12)
 
@@ -154,7 +154,7 @@ def test_sigma_is_one_for_each_variable():
 def test_one_fit_is_the_truncated_gaussian_of_the_elites():
     """The best tenth of N(0, 1) under (z − 0.4)² lies within r of 0.4; momentum keeps a tenth of what was."""
     problem, batches = watched(linear(np.eye(1), np.array([0.4]), np.zeros((1, 1))))
-    run(ICEM(2, 20_000, elites=2000, decay=1.0, momentum=0.1), problem)
+    run(ICEM(2, 20_000, sigma=1.0, elites=2000, decay=1.0, momentum=0.1), problem)
     r = 0.13612  # P(|z − 0.4| < r) = 0.1
     elite = truncnorm(0.4 - r, 0.4 + r)
     assert np.mean(np.abs(batches[0] - 0.4) < r) == pytest.approx(0.1, abs=0.01)
@@ -175,7 +175,7 @@ def test_with_the_references_settings_the_losses_are_the_references(
     problem, beta, iterations, samples, reference, error
 ):
     """10 elites, decay 1.25, momentum 0.1, reuse 0.3, first deviation 1."""
-    optimiser = ICEM(iterations, samples, elites=10, decay=1.25, beta=beta)
+    optimiser = ICEM(iterations, samples, sigma=1.0, elites=10, decay=1.25, beta=beta)
     losses = [run(optimiser, problem(), seed).value for seed in range(20)]
     assert np.mean(losses) == pytest.approx(reference, abs=4 * np.hypot(error, np.std(losses) / np.sqrt(19)))
 
@@ -183,7 +183,7 @@ def test_with_the_references_settings_the_losses_are_the_references(
 @pytest.mark.parametrize(("iterations", "samples"), [(10, 10), (50, 20)])
 def test_the_papers_budgets_are_spent_exactly_in_batches_that_do_not_shrink(iterations, samples):
     problem = tracking()
-    found = run(ICEM(iterations, samples), problem)
+    found = run(ICEM(iterations, samples, sigma=1.0), problem)
     assert problem.batches == [samples] * iterations
     assert found.queries == iterations * samples
 
@@ -198,10 +198,10 @@ def test_few_samples_have_two_elites_and_many_shrink_as_in_the_reference():
 
 def test_elites_are_handed_on_shifted_and_no_worse():
     warm = Elites()
-    first = run(ICEM(10, 40, warm=warm), tracking())
+    first = run(ICEM(10, 40, sigma=1.0, warm=warm), tracking())
     assert warm.z is not None
     problem, batches = watched(tracking())
-    again = run(ICEM(10, 40, warm=warm), problem, seed=1)
+    again = run(ICEM(10, 40, sigma=1.0, warm=warm), problem, seed=1)
     kept = len(warm.z)
     assert batches[0][1][:-1] == pytest.approx(first.z[1:])
     assert kept == 3 and (batches[0][0] == problem.start).all()
@@ -216,7 +216,11 @@ def test_elites_of_another_horizon_are_refused():
 # both
 
 
-@pytest.mark.parametrize("optimiser", [MPPI(10, 100), ICEM(50, 20), ICEM(10, 10)], ids=["mppi", "icem", "icem 10"])
+@pytest.mark.parametrize(
+    "optimiser",
+    [MPPI(10, 100, sigma=1.0), ICEM(50, 20, sigma=1.0), ICEM(10, 10, sigma=1.0)],
+    ids=["mppi", "icem", "icem 10"],
+)
 def test_samples_behind_a_wall_weigh_nothing(optimiser):
     """From beside the wall half of the samples are lost."""
     problem = walled(K=1)
@@ -225,7 +229,7 @@ def test_samples_behind_a_wall_weigh_nothing(optimiser):
     assert (found.z < 1).all()
 
 
-@pytest.mark.parametrize("optimiser", [MPPI(10, 100), ICEM(10, 10)], ids=["mppi", "icem"])
+@pytest.mark.parametrize("optimiser", [MPPI(10, 100, sigma=1.0), ICEM(10, 10, sigma=1.0)], ids=["mppi", "icem"])
 def test_where_every_sample_is_lost_the_start_is_the_answer(optimiser):
     problem = separable()
     problem.inside = lambda z: bool((z == problem.start).all())
