@@ -49,7 +49,7 @@ def station_status(config: StationConfig, seconds: float = 1.0) -> list[DeviceSt
                 failures[name] = error.got
         try:
             since = time.time_ns()
-            time.sleep(seconds)  # a window in which to listen, not a wait for something to come
+            time.sleep(seconds)  # a rate is what comes in a span of time: to end it early would falsify it
             return [
                 DeviceStatus(name, d.kind, d.backend, False, note=failures[name])
                 if name in failures

@@ -130,8 +130,8 @@ class Skill(ABC):
         parameters: Any,
         scene: Scene,
         form: Form = Form.CLOSED,
-        weights: LossWeights = LossWeights(),  # noqa: B008 - frozen
-        limits: Limits = Limits(),  # noqa: B008 - frozen
+        weights: LossWeights = LossWeights(),
+        limits: Limits = Limits(),
     ) -> SkillTask:
         """Return the task.
 

@@ -63,8 +63,8 @@ class ExtrinsicPivoting(Skill):
         parameters: ExtrinsicPivotingParameters,
         scene: Scene,
         form: Form = Form.CLOSED,
-        weights: LossWeights = LossWeights(),  # noqa: B008 - frozen
-        limits: Limits = Limits(),  # noqa: B008 - frozen
+        weights: LossWeights = LossWeights(),
+        limits: Limits = Limits(),
     ) -> SkillTask:
         """Return the task; see `planning.skills.base.Skill.task`."""
         extrinsic = on_object.extrinsic_of(scene, ExtrinsicPivoting.name)

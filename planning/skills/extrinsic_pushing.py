@@ -46,8 +46,8 @@ class ExtrinsicPushing(Skill):
         parameters: ExtrinsicPushingParameters,
         scene: Scene,
         form: Form = Form.CLOSED,
-        weights: LossWeights = LossWeights(),  # noqa: B008 - frozen
-        limits: Limits = Limits(),  # noqa: B008 - frozen
+        weights: LossWeights = LossWeights(),
+        limits: Limits = Limits(),
     ) -> SkillTask:
         """Return the task; see `planning.skills.base.Skill.task`."""
         extrinsic, steps = on_object.extrinsic_of(scene, ExtrinsicPushing.name), parameters.steps

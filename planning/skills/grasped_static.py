@@ -52,8 +52,8 @@ class GraspedStatic(Skill):
         parameters: StaticParameters,
         scene: Scene,
         form: Form = Form.CLOSED,
-        weights: LossWeights = LossWeights(),  # noqa: B008 - frozen
-        limits: Limits = Limits(),  # noqa: B008 - frozen
+        weights: LossWeights = LossWeights(),
+        limits: Limits = Limits(),
     ) -> SkillTask:
         """Return the task; see `planning.skills.base.Skill.task`."""
         steps = parameters.steps

@@ -38,8 +38,8 @@ class RelativeSliding(Skill):
         parameters: RelativeSlidingParameters,
         scene: Scene,
         form: Form = Form.CLOSED,
-        weights: LossWeights = LossWeights(),  # noqa: B008 - frozen
-        limits: Limits = Limits(),  # noqa: B008 - frozen
+        weights: LossWeights = LossWeights(),
+        limits: Limits = Limits(),
     ) -> SkillTask:
         """Return the task; see `planning.skills.base.Skill.task`."""
         steps, half = parameters.steps, parameters.travel_mm * 0.5e-3

@@ -1,4 +1,3 @@
-import os
 import re
 import subprocess
 import sys
@@ -11,16 +10,9 @@ from ruamel.yaml import YAML
 
 from drivers.errors import NotConnected
 from drivers.tags import TagDetector, refine_corners, regions_around, tag_bitmap
+from tests.recordings import recording
 
 ROOT = Path(__file__).parents[2]
-DATA = Path(os.environ.get("EXTRINSIC_DATA", ROOT.parent / "shared" / "data"))
-
-
-def folder(name: str) -> Path:
-    path = DATA / name
-    if not path.is_dir():
-        pytest.skip(f"real images absent: {path} (set EXTRINSIC_DATA)")
-    return path
 
 
 def photograph(path: Path) -> np.ndarray:
@@ -205,7 +197,7 @@ def reference(path: Path) -> list[tuple[int, np.ndarray]]:
     ("photo", "n_tags", "n_found"), [("33369213973_9d9bb4cc96_c", 12, 12), ("34085369442_304b6bafd9_c", 25, 24)]
 )
 def test_tags_in_photographs_are_where_the_reference_detector_saw_them(photo: str, n_tags: int, n_found: int) -> None:
-    path = folder("apriltag_umich")
+    path = recording("apriltag_umich")
     image = photograph(path / f"{photo}.jpg")
     expected = reference(path / f"{photo}.txt")
     assert len(expected) == n_tags
@@ -217,7 +209,7 @@ def test_tags_in_photographs_are_where_the_reference_detector_saw_them(photo: st
 @pytest.fixture(scope="module")
 def rotations() -> tuple[dict[int, np.ndarray], np.ndarray, float]:
     """Pictures by the angle the tag was set to, the camera's K, and the tag's size."""
-    path = folder("apriltag_rotation")
+    path = recording("apriltag_rotation")
     info = YAML(typ="safe").load(path / "test_info.yaml")["rotation_test"]
     pictures = {}
     for file in sorted(path.glob("test_image_rotation_*.png")):

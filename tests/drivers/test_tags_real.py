@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
@@ -15,9 +14,8 @@ import pytest
 from ruamel.yaml import YAML
 
 from drivers.tags import TagDetector
+from tests.recordings import recording
 
-DATA = Path(os.environ.get("EXTRINSIC_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
-ROTATIONS, PHOTOGRAPHS = DATA / "apriltag_rotation", DATA / "apriltag_umich"
 LABELS = 3.5  # degrees; as well as a person set the tag
 
 
@@ -30,11 +28,10 @@ def grey(path: Path) -> np.ndarray:
 @pytest.fixture(scope="module")
 def turned() -> tuple[dict[int, np.ndarray], np.ndarray, float]:
     """Corners (4, 2) of the tag by the angle it was set to [deg], the camera's K, the tag's size [m]."""
-    if not ROTATIONS.is_dir():
-        pytest.skip(f"real pictures absent: {ROTATIONS} (set EXTRINSIC_DATA)")
-    info = YAML(typ="safe").load(ROTATIONS / "test_info.yaml")["rotation_test"]
+    folder = recording("apriltag_rotation")
+    info = YAML(typ="safe").load(folder / "test_info.yaml")["rotation_test"]
     out = {}
-    for path in sorted(ROTATIONS.glob("test_image_rotation_*.png")):
+    for path in sorted(folder.glob("test_image_rotation_*.png")):
         (tag,) = TagDetector().detect(grey(path))
         assert tag.id == 76
         out[int(path.stem.rsplit("_", 1)[1])] = tag.corners
@@ -66,11 +63,10 @@ def golden(path: Path) -> list[tuple[int, np.ndarray]]:
 
 @pytest.mark.parametrize(("photo", "seen"), [("33369213973_9d9bb4cc96_c", 12), ("34085369442_304b6bafd9_c", 24)])
 def test_every_tag_of_a_photograph_is_where_the_reference_detector_has_one(photo: str, seen: int) -> None:
-    if not PHOTOGRAPHS.is_dir():
-        pytest.skip(f"real pictures absent: {PHOTOGRAPHS} (set EXTRINSIC_DATA)")
-    expected = golden(PHOTOGRAPHS / f"{photo}.txt")
+    photographs = recording("apriltag_umich")
+    expected = golden(photographs / f"{photo}.txt")
     # the reference took its corners before any refinement
-    found = TagDetector(decimate=1, refine=False, max_hamming=2).detect(grey(PHOTOGRAPHS / f"{photo}.jpg"))
+    found = TagDetector(decimate=1, refine=False, max_hamming=2).detect(grey(photographs / f"{photo}.jpg"))
     near = [
         min((np.abs(tag.corners - corners).max() for id, corners in expected if id == tag.id), default=np.inf)
         for tag in found

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,8 +9,7 @@ from hypothesis import strategies as st
 
 from estimation.clock_fit import fit_delay, fresh
 from estimation.errors import FitError
-
-DATA = Path(os.environ.get("EXTRINSIC_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
+from tests.recordings import recording
 
 Stream = tuple[np.ndarray, np.ndarray]
 
@@ -150,10 +146,7 @@ def test_what_is_no_number_too_short_or_of_two_lengths_is_told() -> None:
 
 
 def recorded(name: str, columns: int) -> Stream:
-    path = DATA / "pushing" / "time_delay" / name
-    if not path.is_file():
-        pytest.skip(f"recording absent: {path} (set EXTRINSIC_DATA)")
-    words = path.read_text().split()
+    words = recording(f"pushing/time_delay/{name}").read_text().split()
     return np.array([int(w) for w in words[::columns]]), np.array([float(w) for w in words[1::columns]])
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from collections.abc import Iterable
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -24,6 +22,7 @@ from estimation.tactile_pose_strips import RidgeStrips
 from mechanics.camera import CameraModel
 from mechanics.catalogue import load_object
 from mechanics.readings import ImageReading, Stamp
+from tests.recordings import DATA, recorded
 
 PERIOD = 1 / 30
 PITCH = 1e-3
@@ -242,9 +241,7 @@ def test_simulated_touches_are_found_and_releases_are_clean(figures: DepthNoise,
 
 # -- a real Soft Bubble ------------------------------------------------------------------------------------------------
 
-ROOT = Path(__file__).parents[2]
-FOLDER = Path(os.environ.get("EXTRINSIC_DATA", ROOT.parent / "shared" / "data")) / "softbubble"
-recorded = pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no recording of a Soft Bubble in {FOLDER}")
+FOLDER, real = DATA / "softbubble", recorded("softbubble")
 #: frames with a touch, and the one that nobody labelled
 TOUCHED, UNLABELLED = set(range(62, 110)), 61
 
@@ -301,7 +298,7 @@ class Kept(ContactMemory):
         return super().touch(inward, valid, pitch, stamp, alone)
 
 
-@recorded
+@real
 def test_contact_is_seen_in_the_frames_of_the_recording_that_have_it_and_in_no_other(film) -> None:
     finger, pictures = film
     memory = Kept()
@@ -318,14 +315,14 @@ def test_contact_is_seen_in_the_frames_of_the_recording_that_have_it_and_in_no_o
         assert {k for k, asked in enumerate(memory.asked) if other.touch(*asked).found} - {UNLABELLED} == TOUCHED
 
 
-@recorded
+@real
 def test_a_picture_of_the_recording_alone_does_not_tell_the_first_touch_from_the_trace(film) -> None:
     finger, pictures = film
     touched, _ = frames(DepthReader(finger), pictures[58:68] + pictures[104:116])
     assert touched == set(range(63 - 58, 10 + 110 - 104))
 
 
-@recorded
+@real
 def test_the_recording_says_itself_how_much_its_camera_mixes(depth: np.ndarray) -> None:
     # from the untouched frames alone: noise that is mixed is as alike from frame to frame as the share of the last one
     noise = depth[:60, 10:110, 10:150]

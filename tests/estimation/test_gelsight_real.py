@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import cv2
@@ -13,11 +12,9 @@ from estimation.gel_deformation import GelReference, deformation
 from estimation.gel_markers import find_dots
 from estimation.gel_straight_edges import StraightEdge, straight_edges
 from estimation.tactile_pose import PoseStatus
+from tests.recordings import DATA, recorded
 
-ROOT = Path(__file__).parents[2]
-DATA = Path(os.environ.get("EXTRINSIC_DATA", ROOT.parent / "shared" / "data"))
-gelslim_data = pytest.mark.skipif(not (DATA / "gelslim").is_dir(), reason=f"no pictures of a GelSlim in {DATA}")
-gelsight_data = pytest.mark.skipif(not (DATA / "gelsight_edges").is_dir(), reason=f"no GelSight edges in {DATA}")
+gelslim_data, gelsight_data = recorded("gelslim"), recorded("gelsight_edges")
 PRESSES = (3, 4, 5, 6, 7, 8, 9, 10, 13, 14, 15, 17)
 
 

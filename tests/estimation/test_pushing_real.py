@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from estimation.friction_fit import sliding_forces
+from tests.recordings import DATA, recorded
 
-ROOT = Path(__file__).parents[2]
-FOLDER = Path(os.environ.get("EXTRINSIC_DATA", ROOT.parent / "shared" / "data")) / "pushing"
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no recordings of pushes in {FOLDER}")
+FOLDER = DATA / "pushing"
+pytestmark = recorded("pushing")
 
 
 def columns(path: Path, width: int) -> np.ndarray:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from shapely.geometry import box
 
 from mechanics.catalogue import CATALOGUE, SENSORS, load_object, load_sensor
 from mechanics.yaml_input import InputError
+from tests.recordings import DATA, recorded
 
 OBJECTS = ["hbox", "tall_box", "z", "heptagon", "pentagon", "triangle"]
 
@@ -36,12 +36,9 @@ def test_radius_of_gyration_is_the_papers_to_a_tenth_of_a_millimetre(name, rho_m
     assert load_object(name).polygon.radius_of_gyration * 1e3 == pytest.approx(rho_mm, abs=0.1)
 
 
+@recorded("../paper_tables.yaml")
 def test_the_papers_tables_say_the_same():
-    folder = os.environ.get("EXTRINSIC_DATA", Path(__file__).parents[2] / ".." / "shared" / "data")
-    tables = Path(folder).parent / "paper_tables.yaml"
-    if not tables.is_file():
-        pytest.skip("the paper's tables are not on this machine")
-    paper = YAML(typ="safe", pure=True).load(tables.read_text())
+    paper = YAML(typ="safe", pure=True).load((DATA / "../paper_tables.yaml").read_text())
     assert paper["pivoting"]["radius_of_gyration_mm"] == RADIUS_OF_GYRATION_MM
     assert paper["stiffness"] == PRINTED
 

@@ -23,6 +23,7 @@ from planning.optimisers.lm import LevenbergMarquardt
 from planning.plan import Plan
 from planning.planner import plan
 from planning.skills.base import SKILLS, Scene
+from tests.drivers.sim.oracle.motion import Hand
 
 #: the kernels may have to be compiled first
 pytestmark = pytest.mark.timeout(600)
@@ -70,32 +71,6 @@ CASES = (
     Case("extrinsic_pivoting", "triangle", {}, 0.8),
     Case("extrinsic_pivoting", "triangle", {"angle_deg": (30, 55)}, mass=0.1),
 )
-
-
-class Hand:
-    """Moves the plant's end-effector along quintic ramps, with its velocity fed forward."""
-
-    def __init__(self, plant: Plant):
-        self.plant, self.at = plant, np.array(plant.ee_pose)
-
-    def ramp(self, goal, seconds: float) -> dict[tuple[str, str], str]:
-        """Go to X_W_ee (3,); return the modes half-way."""
-        start, n, modes = self.at, round(seconds / self.plant.timestep), {}
-        step = np.asarray(goal, float) - start
-        for i in range(1, n + 1):
-            s = i / n
-            place = s**3 * (10 - 15 * s + 6 * s * s)
-            speed = 30 * s * s * (1 - s) ** 2 / seconds
-            self.plant.step(tuple((start + place * step).tolist()), tuple((speed * step).tolist()))
-            if i == n // 2:
-                modes = modes_of(self.plant)
-        self.at = start + step
-        return modes
-
-    def rest(self, seconds: float) -> None:
-        """Stay."""
-        for _ in range(round(seconds / self.plant.timestep)):
-            self.plant.step(tuple(self.at.tolist()), (0.0, 0.0, 0.0))
 
 
 def modes_of(plant: Plant) -> dict[tuple[str, str], str]:
@@ -159,10 +134,11 @@ def execute(p: Plan, scene: Scene, mu_ground: float) -> Executed:
     for k in range(p.steps):
         planned = {pair: p.contact_modes[k][c].value for c, pair in enumerate(p.contact_bodies or ())}
         slides = any(mode.startswith("slip") for mode in planned.values())
-        half_way = hand.ramp(p.ee[k], SLIDE if slides else RAMP)
+        under_way: dict[tuple[str, str], str] = {}
+        hand.ramp(p.ee[k], SLIDE if slides else RAMP, lambda seen=under_way: seen.update(modes_of(plant)))
         hand.rest(REST)
         if k > 0 or not slides:
-            assert (half_way if slides else modes_of(plant)) == planned, f"step {k}"
+            assert (under_way if slides else modes_of(plant)) == planned, f"step {k}"
         eo = (0.0, 0.0) if p.eo is None else away(plant.eo, p.eo[k])
         force = float(np.hypot(*(plant.coupling_wrench() - p.wrench[k])[:2]))
         errors.append([*eo, *away(plant.go, p.go[k]), force])

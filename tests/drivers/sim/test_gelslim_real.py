@@ -1,6 +1,5 @@
 """How pictures of the simulated GelSlim compare with those of real gels."""
 
-import os
 from pathlib import Path
 
 import cv2
@@ -9,13 +8,12 @@ import pytest
 
 from drivers.sim.gel_noise import GelNoise
 from drivers.sim.mismatch import load_profile
+from tests.recordings import DATA, recorded
 
 from .finger_cases import BOX, HEXAGON, NOWHERE, FakeWorld, opened, pose, view
 
-DATA = Path(os.environ.get("EXTRINSIC_DATA", Path(__file__).parents[4] / "shared" / "data"))
 FIGURES = Path(__file__).parents[3] / "build" / "figures"
-gelslim_data = pytest.mark.skipif(not (DATA / "gelslim").is_dir(), reason="no pictures of a real GelSlim")
-gelsight_data = pytest.mark.skipif(not (DATA / "gelsight_edges").is_dir(), reason="no pictures of a real GelSight")
+gelslim_data, gelsight_data = recorded("gelslim"), recorded("gelsight_edges")
 
 
 def read(path: str | Path) -> np.ndarray:

@@ -5,7 +5,6 @@ The figure goes to `build/figures`, which is never part of the project; statisti
 
 from __future__ import annotations
 
-import os
 import warnings
 from pathlib import Path
 
@@ -18,10 +17,11 @@ from drivers.sim.bubble_membrane import Membrane
 from drivers.sim.bubble_noise import NoiseSource
 from drivers.sim.bubble_optics import BubbleView, quantised
 from drivers.sim.mismatch import load_profile
+from tests.recordings import DATA, recorded
 
 ROOT = Path(__file__).parents[3]
-FOLDER = Path(os.environ.get("EXTRINSIC_DATA", ROOT.parent / "shared" / "data")) / "softbubble"
-pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason=f"no recording of a Soft Bubble in {FOLDER}")
+FOLDER = DATA / "softbubble"
+pytestmark = recorded("softbubble")
 
 #: pinhole of the recording [px], at a quarter of its resolution one pixel in four; where its dome's axis is [m]
 FOCAL, CENTRE, AXIS = 434.0, (313.7, 247.5), (0.021, -0.0017)

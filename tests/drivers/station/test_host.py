@@ -141,18 +141,21 @@ def test_an_interrupt_from_the_keyboard_does_not_reach_the_host(config: StationC
 
 
 def test_a_host_of_another_station_file_is_refused(devices: Devices, config: StationConfig) -> None:
-    other = config.model_copy(update={"world": config.world.model_copy(update={"timestep": 0.0005})})  # type: ignore
+    assert config.world is not None
+    other = config.model_copy(update={"world": config.world.model_copy(update={"timestep": 0.0005})})
     with pytest.raises(NotConnected, match=r"another world\.timestep"), Station(other).connect():
         pass
 
 
 def test_a_host_takes_profile_and_stiffness_from_the_run_that_joins(devices: Devices, config: StationConfig) -> None:
-    softer = config.model_copy(update={"world": config.world.model_copy(update={"stiffness_scale": 0.5})})  # type: ignore
+    assert config.world is not None
+    half = config.world.model_copy(update={"stiffness_scale": 0.5})
+    softer = config.model_copy(update={"world": half})
     with Station(softer).connect() as joined:
-        assert joined.simulation is not None and softer.world is not None
+        assert joined.simulation is not None
         sags = []
-        for world in (config.world, softer.world):
-            joined.simulation.reset(0, scene(), world.model_dump())  # type: ignore[union-attr]
+        for world in (config.world, half):
+            joined.simulation.reset(0, scene(), world.model_dump())
             truth = joined.simulation.truth()
             sags.append(truth.ee[1] - truth.go[1])
         assert sags[1] - sags[0] == pytest.approx(MASS * 9.81 / 2000.0, rel=1e-3)  # half the stiffness, twice the sag

@@ -87,7 +87,9 @@ def test_a_stock_ros_reader_decodes_every_type(tmp_path: Path) -> None:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
         found = {channel.topic: message for _, channel, _, message in reader.iter_decoded_messages()}
-        schemas = {schema.name: schema.encoding for schema in reader.get_summary().schemas.values()}  # type: ignore
+        summary = reader.get_summary()
+        assert summary is not None
+        schemas = {schema.name: schema.encoding for schema in summary.schemas.values()}
     assert found["sim/ft/wrench"].wrench.torque.z == 5.0
     assert list(found["sim/world/truth"].go) == [2.0, 2.0, 2.0]
     assert found["sim/camera/detections"].detections[0].id == 7
@@ -221,7 +223,7 @@ while True:
     i += 1
     if i == 400:
         print("two seconds' worth", flush=True)
-    time.sleep(0.005)  # the pace of a source of data; nothing is waited for
+    time.sleep(0.005)  # a source's pace: the claim is of seconds lost, and without one 400 messages pass in one flush
 """
 
 

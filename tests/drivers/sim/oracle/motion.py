@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,8 @@ class Hand:
     def __init__(self, plant: Any):
         self.plant, self.at = plant, np.array(plant.ee_pose)
 
-    def ramp(self, goal, seconds: float) -> None:
-        """Go to X_W_ee (3,)."""
+    def ramp(self, goal, seconds: float, half_way: Callable[[], object] = lambda: None) -> None:
+        """Go to X_W_ee (3,), and call ``half_way`` where it is fastest."""
         start, n = self.at, round(seconds / self.plant.timestep)
         step = np.asarray(goal, float) - start
         for i in range(1, n + 1):
@@ -28,6 +29,8 @@ class Hand:
             place = s**3 * (10 - 15 * s + 6 * s * s)
             speed = 30 * s * s * (1 - s) ** 2 / seconds
             self.plant.step(tuple((start + place * step).tolist()), tuple((speed * step).tolist()))
+            if i == n // 2:
+                half_way()
         self.at = start + step
 
     def rest(self, seconds: float) -> None:
