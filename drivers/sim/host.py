@@ -98,7 +98,7 @@ class Host:
             run=self.inbox.put,
             now_ns=self._now_ns,
             shift_ns=lambda: self.skipped_ns,
-            lossless=self.world.lockstep,
+            lockstep=self.world.lockstep,
         )
         self._stopping = False
         self._staged = False

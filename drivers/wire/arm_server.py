@@ -12,7 +12,7 @@ import numpy as np
 from drivers.errors import CommandRefused, DriverError
 from drivers.interfaces import Arm, ArmTarget
 from drivers.wire import messages, topics
-from drivers.wire.lease import LeaseTable
+from drivers.wire.lease import PATIENT_TIME_TO_LIVE, TIME_TO_LIVE, LeaseTable
 from drivers.wire.server import Answer, Desk, DeviceServer
 
 _TICK = 0.05
@@ -22,14 +22,14 @@ class ArmServer(DeviceServer):
     """An `Arm` on the bus.
 
     A commander holds the lease by a liveliness token (lost at once when its process dies) and by renewal (lost after
-    a second when it is frozen). Losing it holds the arm. Stop and hold need no lease, have queryables of their own
-    and overtake everything that waits.
+    a second when it is frozen; later in lockstep, where nothing moves meanwhile). Losing it holds the arm. Stop and
+    hold need no lease, have queryables of their own and overtake everything that waits.
     """
 
     def __init__(self, desk: Desk, arm: Arm):
         super().__init__(desk, arm)
         self.arm = arm
-        self._table = LeaseTable()
+        self._table = LeaseTable(PATIENT_TIME_TO_LIVE if desk.lockstep else TIME_TO_LIVE)
         self._lock = threading.Lock()
         self._served: str | None = None  # for whom the arm's own lease is held; only the owner's thread touches it
         self._sequence = -1
@@ -111,7 +111,13 @@ class ArmServer(DeviceServer):
         asked = "command a set-point"
         value = messages.decode(payload, messages.TARGET)
         with self._lock:
-            if not self._table.renew(value.holder, time.monotonic()):
+            now = time.monotonic()
+            if not self._table.renew(value.holder, now):
+                if self._table.has_lapsed(value.holder, now):
+                    silent = f"its lease lapsed: nothing was heard of it for {self._table.time_to_live:g} s"
+                    raise CommandRefused(
+                        self.arm.name, asked, silent, "See what held it up, and acquire the lease anew"
+                    )
                 raise CommandRefused(self.arm.name, asked, "no lease", "Acquire the lease: `with arm.lease(name):`")
         numbers = (*value.pose, *value.twist, value.duration)
         if not np.all(np.isfinite(numbers)) or value.duration < 0:

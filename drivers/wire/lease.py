@@ -11,6 +11,9 @@ from dataclasses import dataclass
 TIME_TO_LIVE = 1.0
 """How long a lease lasts without renewal [s]: the reach of a frozen commander."""
 
+PATIENT_TIME_TO_LIVE = 20.0
+"""The same in lockstep [s]: there a frozen commander moves nothing, so nobody but the next commander waits for it."""
+
 RENEWAL = 0.25
 """How often a holder renews [s]: three renewals may be lost before the lease lapses."""
 
@@ -22,6 +25,7 @@ class LeaseTable:
     time_to_live: float = TIME_TO_LIVE
     _holder: str | None = None
     _until: float = 0.0
+    _lapsed: str | None = None
 
     def holder(self, now: float) -> str | None:
         """Who has the lease at ``now``, or None."""
@@ -31,7 +35,7 @@ class LeaseTable:
         """Take the lease if it is free or already one's own."""
         if self.holder(now) not in (None, holder):
             return False
-        self._holder, self._until = holder, now + self.time_to_live
+        self._holder, self._until, self._lapsed = holder, now + self.time_to_live, None
         return True
 
     def renew(self, holder: str, now: float) -> bool:
@@ -52,5 +56,9 @@ class LeaseTable:
         """Free a lease that ran out; returns who lost it, once."""
         if self._holder is None or now < self._until:
             return None
-        lost, self._holder = self._holder, None
-        return lost
+        self._lapsed, self._holder = self._holder, None
+        return self._lapsed
+
+    def has_lapsed(self, holder: str, now: float) -> bool:
+        """Whether ``holder`` was the last to lose a lease by letting it run out."""
+        return holder in (self._lapsed, self._holder) and self.holder(now) != holder

@@ -82,7 +82,8 @@ class Desk:
     """What the servers of one process share: the bus, the thread that owns the devices, the clock, the streams.
 
     ``run(work, urgent)`` has ``work`` executed by the owner of the devices. ``shift_ns()`` is added to every capture
-    time. With ``lossless`` a slow reader holds up even images, as it may in lockstep, where time stands still for it.
+    time. In ``lockstep`` time stands still for who is slow: a slow reader holds up even images, and a slow commander
+    keeps its lease for longer.
     """
 
     def __init__(
@@ -93,17 +94,17 @@ class Desk:
         run: Run | None = None,
         now_ns: Callable[[], int] = time.time_ns,
         shift_ns: Callable[[], int] = lambda: 0,
-        lossless: bool = False,
+        lockstep: bool = False,
     ):
         self.bus, self.station, self.now_ns, self.shift_ns = bus, station, now_ns, shift_ns
         self.run: Run = run or Lane()
-        self._keep_all = lossless
+        self.lockstep = lockstep
         self.publishers: list[Publisher] = []
         self._lossless: list[Publisher] = []
 
     def publisher(self, device: str, stream: str, type_name: str) -> Publisher:
         """Announce a stream. Images may be dropped on their way to a slow viewer, everything else arrives."""
-        lossy = not self._keep_all and type_name in (messages.IMAGE, messages.COMPRESSED_IMAGE)
+        lossy = not self.lockstep and type_name in (messages.IMAGE, messages.COMPRESSED_IMAGE)
         publisher = self.bus.publisher(topics.key(self.station, device, stream), type_name, lossy)
         for old in [known for known in self.publishers if known.topic == publisher.topic]:
             # a device that comes back goes on with its stream

@@ -23,7 +23,7 @@ import numpy as np
 from experiments import registries
 from experiments.bench.figures import Figure, figure_of
 from experiments.bench.planning_case import Case
-from experiments.bench.planning_optimisers import from_elsewhere, others
+from experiments.bench.planning_optimisers import at_other_slack_weights, from_elsewhere, others
 from experiments.bench.planning_problem import described, disturbed, pivoting_pentagon
 from experiments.bench.planning_timing import Watched, apart, repeated
 from experiments.planning.make import objective
@@ -58,6 +58,8 @@ def run(runs: int = 5, horizons: Sequence[int] = HORIZONS) -> Iterator[Figure]:
         if case.whole:
             yield from from_elsewhere(case)
         if form is Form.PAPER:
+            if case.whole:
+                yield from at_other_slack_weights(case)
             for method, found in cost.items():
                 found[steps] = case.known[method, "iteration"] / steps
     if shortest < longest:

@@ -18,9 +18,6 @@ from planning.optimisers.base import Objective
 from planning.problem import Form, LossWeights, Problem
 
 EXPERIMENT = "extrinsic_pivoting"
-#: penalty of the paper form's slack, beside U = 1: the one that the table to compare with was made at. Plans take a
-#: larger one, with which their balance is closer, and which is kinder to second order than to Adam
-SLACK_WEIGHT = 100.0
 #: how far off the nominal trajectory measurements begin, 1σ in units of z: about 1 mm, 1 N
 AWAY = 0.1
 #: by how much the estimate of the grasp moves between two re-plans, 1σ [m, m, rad]
@@ -44,8 +41,7 @@ def pivoting_pentagon(steps: int, form: Form) -> Problem:
     skill = registries.skills()[stage.skill]
     parameters = stage.skill_parameters.model_copy(update={"steps": steps})
     scene = planning_scene(resolved, setup.believed(resolved, Calibrations()))
-    problem = skill.task(parameters, scene, form=form, weights=LossWeights()).problem
-    return replace(problem, slack_weight=SLACK_WEIGHT)
+    return skill.task(parameters, scene, form=form, weights=LossWeights()).problem
 
 
 def window(problem: Problem, begin: int, steps: int) -> Problem:

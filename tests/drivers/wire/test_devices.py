@@ -312,10 +312,21 @@ def test_a_commander_that_freezes_loses_the_arm_within_two_seconds(
     arm.acquire("frozen")
     arm._done.set()  # no renewal, but its session lives
     assert fake_arm.released.wait(2.0)
-    with pytest.raises(CommandRefused, match="no lease"):
+    with pytest.raises(CommandRefused, match="lapsed: nothing was heard of it for 1 s"):
         arm.command(target())
     with RemoteArm("arm", Link(another(), "lab"), lockstep=True) as second, second.lease("bob"):
         second.command(target())
+
+
+def test_in_lockstep_a_slow_commander_keeps_the_arm(served: Bus, joined: Bus, fake_arm: Any) -> None:
+    with (
+        ArmServer(Desk(served, "slow", now_ns=lambda: 7, lockstep=True), fake_arm),
+        RemoteArm("arm", Link(joined, "slow"), lockstep=True) as remote,
+        remote.lease("busy"),
+    ):
+        remote._done.set()  # too busy to renew
+        assert not fake_arm.released.wait(1.5)
+        remote.command(target())
 
 
 def test_renewal_outlives_the_time_to_live(arm: RemoteArm, fake_arm: Any) -> None:

@@ -51,6 +51,19 @@ def test_a_lapse_is_told_once() -> None:
     assert table.lapse(1.1) is None
 
 
+def test_who_let_a_lease_lapse_is_known_until_it_is_taken_anew() -> None:
+    table = LeaseTable(time_to_live=1.0)
+    table.acquire("a", 0.0)
+    assert not table.has_lapsed("a", 0.9)
+    assert table.has_lapsed("a", 1.0), "before anybody looked"
+    table.lapse(1.1)
+    assert table.has_lapsed("a", 1.2)
+    assert not table.has_lapsed("b", 1.2)
+    table.acquire("a", 1.3)
+    table.release("a")
+    assert not table.has_lapsed("a", 1.4)
+
+
 _STEP = st.tuples(
     st.sampled_from(["acquire", "renew", "release", "lapse"]), st.sampled_from("abc"), st.floats(0.0, 0.7)
 )
