@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from typing import ClassVar
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 
 from mechanics import se2
 from mechanics.readings import Array
@@ -17,15 +18,24 @@ from mechanics.records import PlanarState
 from planning.plan import Plan
 
 
+class LawSettings(BaseModel):
+    """The figures of a control law, as an experiment file gives them; SI unless the name says otherwise."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
 class Controller(ABC):
-    """A control law. One instance runs one trial."""
+    """A control law. One instance runs one trial; ``settings`` are those of its `Settings`, the defaults if None."""
 
     name: ClassVar[str]
     #: whether the law acts on measurements: it then gets a free-air phase and a correction at every waypoint
     feedback: ClassVar[bool] = True
+    #: the model of its figures
+    Settings: ClassVar[type[LawSettings]] = LawSettings
 
-    def __init__(self, plan: Plan):
+    def __init__(self, plan: Plan, settings: LawSettings | None = None):
         self.plan = plan
+        self.settings = self.Settings() if settings is None else settings
         self.correction = np.zeros(3)
 
     @abstractmethod
@@ -33,13 +43,17 @@ class Controller(ABC):
         """Update the correction before touch-down, where only the pose can be wrong."""
 
     @abstractmethod
-    def in_contact(self, go_desired: Array, wrench_desired: Array, measured: PlanarState) -> None:
-        """Update the correction at a settled waypoint with the desired go pose and wrench (3,) in W."""
+    def in_contact(self, step: int, measured: PlanarState) -> None:
+        """Update the correction at settled waypoint ``step``, where the plan has ``go[step]`` and ``wrench[step]``."""
 
     def command(self, go: Array, ee: Array) -> Array:
         """The pose (3,) to command where the plan has the go at ``go`` and the end-effector at ``ee``."""
         X_W_gocf = se2.compose(go, self.plan.X_go_gocf)
         return se2.compose(X_W_gocf, se2.between(X_W_gocf, ee) + self.correction)
+
+    def waypoint(self, step: int) -> Array:
+        """The pose (3,) to command at waypoint ``step``."""
+        return self.command(self.plan.go[step], self.plan.ee[step])
 
 
 CONTROLLERS: dict[str, type[Controller]] = {}

@@ -24,12 +24,15 @@ class ClosedLoop(Controller):
         """Remove the constant part of the pose error before touch-down, where the go moves with the end-effector."""
         self.correction = self.correction + self._pose_error(go_desired, measured)
 
-    def in_contact(self, go_desired: Array, wrench_desired: Array, measured: PlanarState) -> None:
+    def in_contact(self, step: int, measured: PlanarState) -> None:
         """Add e to the running correction."""
-        X_W_gocf = se2.compose(go_desired, self.plan.X_go_gocf)
-        missing = wrench.rotated(wrench_desired - measured.wrench, -X_W_gocf[2])
-        step = self._pose_error(go_desired, measured) + Elasticity(self.plan.stiffness).displacement(missing)
-        self.correction = self.correction + step
+        self.correction = self.correction + self._error(step, measured)
+
+    def _error(self, step: int, measured: PlanarState) -> Array:
+        """The paper's e (3,) at waypoint ``step``."""
+        go = self.plan.go[step]
+        missing = wrench.rotated(self.plan.wrench[step] - measured.wrench, -(go[2] + self.plan.X_go_gocf[2]))
+        return self._pose_error(go, measured) + Elasticity(self.plan.stiffness).displacement(missing)
 
     def _pose_error(self, go_desired: Array, measured: PlanarState) -> Array:
         """go_desired ⊖ go_estimated (3,) at the grasp centre, in gocf; zero where the go was not seen."""

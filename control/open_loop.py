@@ -17,5 +17,5 @@ class OpenLoop(Controller):
     def in_air(self, go_desired: Array, measured: PlanarState) -> None:
         """Does nothing."""
 
-    def in_contact(self, go_desired: Array, wrench_desired: Array, measured: PlanarState) -> None:
+    def in_contact(self, step: int, measured: PlanarState) -> None:
         """Does nothing."""

@@ -158,12 +158,12 @@ class Trial:
     ) -> tuple[PlanarState, Array, PlanarState | None, ContactBelief | None]:
         """Go to waypoint ``k``, let the controller correct it, and measure once settled."""
         s, mover = self._settings, self._mover
-        mover.ramp(controller.command(plan.go[k], plan.ee[k]), s.ramp)
+        mover.ramp(controller.waypoint(k), s.ramp)
         self._settle()
         for _ in range(s.corrections if controller.feedback else 0):
-            controller.in_contact(plan.go[k], plan.wrench[k], self._observer.estimate())
+            controller.in_contact(k, self._observer.estimate())
             self._tell_slip()
-            mover.ramp(controller.command(plan.go[k], plan.ee[k]), s.ramp)
+            mover.ramp(controller.waypoint(k), s.ramp)
             self._settle()
         estimated = self._observer.estimate() if self._observer.fingers else None
         measured = self._observer.measure()

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
 
 from control.settings import TrialSettings
 from experiments import registries
 from experiments.calibrate.schema import CalibrationStage, CalibrationUse, FrictionStage, Pair
 from experiments.planning.schema import PlanStage, Slug
 from mechanics.catalogue import ObjectModel, SensorModel
-from mechanics.yaml_input import Refusal, nearest, one_of
+from mechanics.yaml_input import Refusal, nearest, one_of, validated
 
 Vector2 = tuple[float, float]
 
@@ -65,15 +65,41 @@ def _known_controllers(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class ExecuteStage(_Model):
-    """Run ``trials`` trials of a plan under each controller.
+    """Run ``trials`` trials of a plan under each controller, numbered from ``first``.
 
     ``plan`` names an earlier plan stage, or a plan file (``….npz``) that a run has left under its ``plans/``.
+    ``settings`` are the laws' figures, by the controller's name.
     """
 
     stage: Literal["execute"]
     plan: Annotated[str, _NAME]
     controllers: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_known_controllers)]
+    settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
     trials: int = Field(default=1, ge=1, le=10_000)
+    first: int = Field(default=0, ge=0, le=1_000_000, description="number of the first trial: the grasp is drawn by it")
+
+    @classmethod
+    def submodel(cls, key: str, data: dict[str, Any]) -> type[BaseModel] | None:
+        """The model of the laws' settings, where ``data`` names controllers."""
+        if key != "settings":
+            return None
+        known = registries.controllers()
+        names = [name for name in data.get("controllers", ()) if isinstance(name, str) and name in known]
+        fields: dict[str, Any] = {name: (known[name].Settings, known[name].Settings()) for name in names}
+        return create_model("settings", __config__=_Model.model_config, **fields)
+
+    @model_validator(mode="after")
+    def _settings_are_the_laws(self) -> ExecuteStage:
+        for name, given in self.settings.items():
+            if name not in self.controllers:
+                wrong = f"{name!r} is none of the stage's controllers"
+                raise Refusal(wrong, one_of(self.controllers), nearest(name, self.controllers), at=("settings", name))
+            validated(registries.controllers()[name].Settings, given, at=("settings", name))
+        return self
+
+    def law(self, name: str) -> Any:
+        """The settings of a controller of this stage, as its own model."""
+        return validated(registries.controllers()[name].Settings, self.settings.get(name, {}), at=("settings", name))
 
     @property
     def from_file(self) -> bool:

@@ -6,10 +6,11 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from typing import Any
 
-from control.base import Controller
+from control.base import Controller, LawSettings
 from control.observe import Finger
 from control.trial import Trial, TrialResult, Watch
 from drivers.errors import DeviceTimeout, DriverError, SimulationDiverged
@@ -38,9 +39,9 @@ def execute_stage(context: RunContext, stage: ExecuteStage) -> None:
     devices = context.devices()
     _warm_up(context, stage)
     with devices.arm.lease(context.holder), context.timed(devices):
-        for trial in range(stage.trials):
+        for trial in range(stage.first, stage.first + stage.trials):
             for name in stage.controllers:
-                result = _one_trial(context, devices, plan, registries.controllers()[name], trial)
+                result = _one_trial(context, devices, plan, registries.controllers()[name], stage.law(name), trial)
                 if result.status in ("device_failed", "stopped", "diverged"):
                     return
 
@@ -62,7 +63,7 @@ def _warm_up(context: RunContext, stage: ExecuteStage) -> None:
 
 
 def _one_trial(
-    context: RunContext, devices: Devices, plan: Plan, controller: type[Controller], trial: int
+    context: RunContext, devices: Devices, plan: Plan, controller: type[Controller], law: LawSettings, trial: int
 ) -> TrialResult:
     name = f"{plan.name}-{controller.name}-{trial}"
     begin = TrialRecord(devices.clock.now_ns(), name, plan.skill, controller.name)
@@ -95,7 +96,8 @@ def _one_trial(
             fingers = context.fingers() if controller.feedback else ()  # nobody else asks where the go is
             observer = setup.observer(there, devices, context.settings, context.believed, fingers)
             arrange(context, devices, observer, plan, trial)
-            result = Trial(name, plan, controller, observer, clock, load, context.settings, watch).run()
+            made = partial(controller, settings=law)
+            result = Trial(name, plan, made, observer, clock, load, context.settings, watch).run()
         except SimulationDiverged as error:
             result = TrialResult("diverged", str(error), plan)
         except DriverError as error:  # before the protocol began

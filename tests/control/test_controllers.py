@@ -26,7 +26,7 @@ def test_without_a_measurement_the_plan_is_commanded_as_it_is(plan, controller):
 def test_open_loop_ignores_what_it_is_told(plan):
     law = OpenLoop(plan)
     law.in_air(plan.go[0], state([0.01, 0.01, 0.1]))
-    law.in_contact(plan.go[0], plan.wrench[0], state([0.01, 0.01, 0.1], [9, 9, 9]))
+    law.in_contact(0, state([0.01, 0.01, 0.1], [9, 9, 9]))
     assert law.command(plan.go[1], plan.ee[1]) == pytest.approx(plan.ee[1])
 
 
@@ -45,13 +45,13 @@ def test_with_a_stiffness_error_the_wrench_error_shrinks_by_one_minus_kappa_per_
         displacement = law.command(plan.go[0], plan.ee[0]) - [0.0, 0.1, 0.0]
         wrench = kappa * plan.stiffness @ displacement
         errors.append((plan.wrench[0] - wrench)[1])
-        law.in_contact(plan.go[0], plan.wrench[0], state(plan.go[0], wrench))
+        law.in_contact(0, state(plan.go[0], wrench))
     assert errors == pytest.approx([-4.0 * (1 - kappa) ** (n + 1) for n in range(4)], abs=1e-12)
 
 
 def test_an_object_that_was_not_seen_leaves_the_pose_term_out(plan):
     law = ClosedLoop(plan)
-    law.in_contact(plan.go[0], plan.wrench[0], state(None, [0.0, -3.0, 0.0]))
+    law.in_contact(0, state(None, [0.0, -3.0, 0.0]))
     assert law.correction == pytest.approx([0.0, -1.0 / 1000.0, 0.0])
 
 
