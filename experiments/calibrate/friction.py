@@ -8,17 +8,19 @@ one, and dragged.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.scene import Scene
 from estimation.errors import FitError
 from estimation.friction_fit import GAIN_ERROR, fit_friction
+from estimation.friction_gain import gain_sensitivity, shares
 from experiments import setup
 from experiments.calibrate import store
 from experiments.calibrate.models import FrictionCalibration
 from experiments.calibrate.rig import Rig, at_hand
 from experiments.calibrate.samples import save_samples
 from experiments.calibrate.schema import FrictionStage
-from experiments.calibrate.strokes import Dragged, drawn, stroked, witnesses
+from experiments.calibrate.strokes import Dragged, Dragging, drawn, stroked, witnesses
 from experiments.calibrate.threads import one_thread
 from experiments.context import RunContext
 from mechanics.catalogue import ObjectModel
@@ -30,6 +32,8 @@ TABLE_HALF = 0.1
 STEEPEST = np.radians(50.0)
 #: what is left of a sensor's zero that is taken before and after each stroke, 1 sigma [N]
 TARED = 0.02
+#: what a sensor leaves of the coefficient besides its gains, relative, 1 sigma
+STROKES_ERROR = 0.003
 #: free space between the objects while they are put into place [m]
 ROOM = 0.03
 
@@ -42,33 +46,42 @@ def friction_stage(context: RunContext, stage: FrictionStage) -> None:
         dragged = _arranged(rig, stage)
         length = min(stage.stroke_mm * 1e-3, 1.6 * dragged.half)
         tilt = (float(np.radians(stage.tilt_deg[0])), float(np.radians(stage.tilt_deg[1])))
-        forces = []
+        found: list[Dragging] = []
         strokes = drawn(rng, stage.strokes, tilt, stage.force, length)
         with context.progress.steps(f"strokes of {stage.pair}", len(strokes)) as advance:
             for stroke in strokes:
-                forces.append(stroked(rig, dragged, stroke, stage.speed))
+                found.append(stroked(rig, dragged, stroke, stage.speed))
                 advance()
         _restored(rig, stage)
         rig.home()
         sensors = tuple(witness.sensor.name for witness in witnesses(rig))
-    samples = np.concatenate(forces)
+    samples, strokes_of, gain_error = _joined(found)
     with one_thread():
-        fit = fit_friction(
-            samples,
-            zero_error=TARED,
-            gain_error=GAIN_ERROR / np.sqrt(len(sensors)),
-            strokes=np.repeat(np.arange(len(forces)), [len(one) for one in forces]),
-        )
+        fit = fit_friction(samples, zero_error=TARED, gain_error=gain_error, strokes=strokes_of)
     roles = tuple(body for body in stage.pair.split("-") if body != "ground")
-    found = FrictionCalibration(
+    kept = FrictionCalibration(
         origin=store.origin(resolved, sensors, roles, context.folder.path.name),
         pair=stage.pair,
         mu=fit.mu,
         interval=fit.interval,
         samples=fit.samples,
     )
-    save_samples(context, found.name, {"f_n": samples[:, 0], "f_t": samples[:, 1]})
-    context.calibrated(found)
+    save_samples(context, kept.name, {"f_n": samples[:, 0], "f_t": samples[:, 1]})
+    context.calibrated(kept)
+
+
+def _joined(found: list[Dragging]) -> tuple[Array, NDArray[np.intp], float]:
+    """Forces (n, 2) = (f_n, f_t) of all witnesses as one, the stroke (n,) of each, and what is left of their gains.
+
+    Each is believed by how little its gains can turn the forces as it lies; the last is 1 sigma of an axis, relative.
+    """
+    ratios = [np.median(one.forces[:, :, 1] / one.forces[:, :, 0]) for one in found if one.forces.shape[1]]
+    angles = np.array([one.angles for one in found if one.forces.shape[1]])
+    turned = np.array([gain_sensitivity(ratio, angle) for ratio, angle in zip(ratios, angles, strict=True)])
+    share, left = shares(turned.mean(axis=0), GAIN_ERROR, STROKES_ERROR)
+    strokes = np.repeat(np.arange(len(found)), [one.forces.shape[1] for one in found])
+    samples = np.concatenate([np.tensordot(share, one.forces, 1) for one in found])
+    return samples, strokes, left / np.sqrt(2)
 
 
 def _arranged(rig: Rig, stage: FrictionStage) -> Dragged:

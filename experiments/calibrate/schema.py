@@ -76,7 +76,9 @@ class FrictionStage(_Model):
     pair: Pair
     strokes: int = Field(default=16, ge=1, le=1000)
     force: Vector2 = Field(default=(3.0, 6.0), description="range of the normal force [N]")
-    tilt_deg: Vector2 = Field(default=(15.0, 35.0), description="range of the held object's tilt")
+    tilt_deg: Vector2 = Field(
+        default=(8.0, 20.0), description="range by which the held object leans back from where it is dragged to"
+    )
     stroke_mm: float = Field(default=15.0, gt=0, le=200, description="length of a stroke")
     speed: float = Field(default=0.02, gt=0, le=0.2, description="[m/s]")
 

@@ -86,22 +86,35 @@ def drawn(
 ) -> list[Stroke]:
     """Random strokes, every other one to the other side.
 
-    The object trails: its grasp leans to where the motion goes, so that friction lifts the contact and does not jam it.
+    The object leans back, as far as friction turns the contact force or less: that runs then along an axis of the wrist
+    sensor, where its gains turn it least. Leaning to where the motion goes they would turn it by half as much again as
+    the gains differ.
     """
     strokes = []
     for i in range(count):
         direction = 1.0 if i % 2 else -1.0
-        lean = -direction * float(rng.uniform(*tilt))
+        lean = direction * float(rng.uniform(*tilt))
         strokes.append(Stroke(lean, float(rng.uniform(*force)), -0.5 * direction * length, 0.5 * direction * length))
     return strokes
 
 
-def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Array:
-    """Contact forces (n, 2) = (f_n, f_t) [N] on the object while it moves evenly in a stroke, in the face's axes.
+@dataclass(frozen=True, eq=False)
+class Dragging:
+    """What a stroke showed: ``forces`` (w, n, 2) = (f_n, f_t) [N] on the object by each of the `witnesses`.
 
-    t is the normal turned by −90°. The mean of what `witnesses` say; each one's zero is taken before touch-down and
-    after the stroke, and drifts evenly in between. Before the stroke the normal force is brought to what is asked,
-    since nobody knows the grasp to the last tenth. Raises FitError for a stroke too short to tell anything.
+    ``angles`` (w,) [rad] are those of the sensors' axes in the face's (t, n), t being the normal turned by −90°.
+    """
+
+    forces: Array
+    angles: Array
+
+
+def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Dragging:
+    """Contact forces on the object while it moves evenly in a stroke, in the face's axes.
+
+    Each witness's zero is taken before touch-down and after the stroke, and drifts evenly in between. Before the stroke
+    the normal force is brought to what is asked, since nobody knows the grasp to the last tenth. Raises FitError for a
+    stroke too short to tell anything.
     """
     length = abs(stroke.end - stroke.begin)
     even = (1 - 2 * GETTING_UP) * length / speed - SWINGING
@@ -138,16 +151,16 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Array:
     rig.rest(0.3)
     after = _Rest.taken(rig, seen_by, 0.4)
     share = (begin + (np.arange(len(moving[0])) + 0.5) * BIN * 1e9 - before.at_ns) / (after.at_ns - before.at_ns)
-    on_object = np.mean(
+    on_object = np.array(
         [
             force - zero - share[:, None] * (later - zero)
             for force, zero, later in zip(moving, before.forces, after.forces, strict=True)
-        ],
-        axis=0,
+        ]
     )
     tangent = np.array([normal[1], -normal[0]])
-    forces = np.column_stack([on_object @ normal, on_object @ tangent])
-    return forces[forces[:, 0] > TOUCHED]
+    forces = np.stack([on_object @ normal, on_object @ tangent], axis=-1)
+    angles = np.array([witness.angle(mover.pose) for witness in seen_by]) - dragged.X_W_face[2]
+    return Dragging(forces[:, np.mean(forces[:, :, 0], axis=0) > TOUCHED], angles)
 
 
 def _dragged(rig: Rig, path: Array, seconds: float) -> tuple[int, int]:
@@ -185,6 +198,10 @@ class Witness(ABC):
     def force(self, reading: Array, X_W_ee: Array) -> Array:
         """Force (2,) [N] on the object, axes of W, by a reading (6,) with the end-effector at ``X_W_ee`` (3,)."""
 
+    @abstractmethod
+    def angle(self, X_W_ee: Array) -> float:
+        """That of the sensor's axes in W [rad] with the end-effector at ``X_W_ee`` (3,)."""
+
     def between(self, begin: int, end: int) -> Array:
         """Forces (n, 2), each of a `BIN` from ``begin`` to ``end`` [ns]; NaN where a bin has no reading."""
         readings = [r for r in self.sensor.since(begin) if r.stamp.status is Status.OK and r.stamp.capture_ns <= end]
@@ -209,8 +226,10 @@ class _Table(Witness):
     """The sensor under the table carries what the object presses on it, as long as nothing is added or taken away."""
 
     def force(self, reading: Array, X_W_ee: Array) -> Array:
-        angle = self.sensor.describe().extra["pose"][2]
-        return -se2.rotate(angle, TaskPlane().wrench_to_planar(reading)[:2])
+        return -se2.rotate(self.angle(X_W_ee), TaskPlane().wrench_to_planar(reading)[:2])
+
+    def angle(self, X_W_ee: Array) -> float:
+        return float(self.sensor.describe().extra["pose"][2])
 
 
 class _Wrist(Witness):
@@ -219,11 +238,14 @@ class _Wrist(Witness):
     def force(self, reading: Array, X_W_ee: Array) -> Array:
         return -self.rig.observer.wrist_sensor.wrench_on_go(reading, X_W_ee, X_W_ee[:2])[:2]
 
+    def angle(self, X_W_ee: Array) -> float:
+        return float(X_W_ee[2] + self.rig.observer.wrist_sensor.X_ee_s[2])
+
 
 def witnesses(rig: Rig) -> list[Witness]:
     """Who tells the contact force: the sensor under the table, and the wrist's where the tool on it has been weighed.
 
-    Each sensor's gain is off on its own, and no sample shows it; two halve the variance.
+    Each sensor's gain is off on its own, and no sample shows it (`estimation.friction_gain`).
     """
     found: list[Witness] = [_Table(rig, rig.devices.force_torque("table"))]
     if rig.context.believed.tool is not None:
