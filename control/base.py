@@ -7,11 +7,12 @@ pose at waypoint k is go_k ⊕ X_go_gocf ⊕ (K⁻¹ w_k + c).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from control.monitor import Deviation
 from mechanics import se2
 from mechanics.readings import Array
 from mechanics.records import PlanarState
@@ -30,6 +31,8 @@ class Controller(ABC):
     name: ClassVar[str]
     #: whether the law acts on measurements: it then gets a free-air phase and a correction at every waypoint
     feedback: ClassVar[bool] = True
+    #: whether the law takes, as ``task``, what its plan was made of (`planning.skills.base.SkillTask`)
+    needs_task: ClassVar[bool] = False
     #: the model of its figures
     Settings: ClassVar[type[LawSettings]] = LawSettings
 
@@ -46,6 +49,14 @@ class Controller(ABC):
     def in_contact(self, step: int, measured: PlanarState) -> None:
         """Update the correction at settled waypoint ``step``, where the plan has ``go[step]`` and ``wrench[step]``."""
 
+    def replan(self, step: int, measured: PlanarState, deviation: Deviation) -> bool:
+        """Asked at waypoint ``step``, before ``deviation`` counts: whether the law has taken it in and can go on."""
+        return False
+
+    def told(self) -> dict[str, Any] | None:
+        """What a trial's row says of the law, as JSON can hold it; None: nothing."""
+        return None
+
     def command(self, go: Array, ee: Array) -> Array:
         """The pose (3,) to command where the plan has the go at ``go`` and the end-effector at ``ee``."""
         X_W_gocf = se2.compose(go, self.plan.X_go_gocf)
@@ -58,8 +69,10 @@ class Controller(ABC):
 
 CONTROLLERS: dict[str, type[Controller]] = {}
 
+C = TypeVar("C", bound=type[Controller])
 
-def register(controller: type[Controller]) -> type[Controller]:
+
+def register(controller: C) -> C:
     """Make a controller available to experiment files under its name."""
     CONTROLLERS[controller.name] = controller
     return controller

@@ -25,7 +25,12 @@ class TrialSettings(BaseModel):
     )
     tactile_frames: int = Field(default=2, ge=1, le=30, description="pictures of each finger for an estimate")
     tag_frames: int = Field(default=1, ge=1, le=100, description="camera frames averaged per measurement")
-    corrections: int = Field(default=1, ge=0, le=10, description="feedback updates at a waypoint before it is recorded")
+    corrections: int = Field(
+        default=1,
+        ge=0,
+        le=10,
+        description="feedback updates at a waypoint before it is recorded; one at most where a contact slips",
+    )
     air_corrections: int = Field(default=3, ge=0, le=20, description="pose updates in free air before touch-down")
     preload: float = Field(default=1.0, gt=0, le=30, description="duration of the force ramp at fixed object pose [s]")
     clearance_mm: float = Field(default=10.0, gt=0, le=200, description="height above touch, before and after")
@@ -33,5 +38,11 @@ class TrialSettings(BaseModel):
     touch_speed: float = Field(default=0.01, gt=0, le=0.1, description="mean speed of the descent to touch [m/s]")
     start_tolerance_mm: float = Field(default=5.0, gt=0, description="farthest the go may start from the plan")
     start_tolerance_deg: float = Field(default=5.0, gt=0, description="and its angle")
-    slip_tolerance_mm: float = Field(default=5.0, gt=0, description="motion of a sticking contact that ends the trial")
+    slip_tolerance_mm: float = Field(
+        default=0.8, gt=0, description="motion of a contact since touch-down, against its planned mode, that deviates"
+    )
+    on_deviation: Literal["end", "record"] = Field(
+        default="end",
+        description="what a slip or a lost contact does: it ends the trial, or is recorded and the trial goes on",
+    )
     force_limit: float = Field(default=30.0, gt=0, description="measured force that ends the trial [N]")

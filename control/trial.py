@@ -12,7 +12,7 @@ import numpy as np
 
 from control.approach import anchored, resting_eo, retreat
 from control.base import Controller
-from control.monitor import ContactMonitor
+from control.monitor import ContactMonitor, Deviation, slips
 from control.motion import Mover
 from control.observe import Observer
 from control.settings import TrialSettings
@@ -31,6 +31,7 @@ class TrialResult:
     """How a trial ended (statuses of design §6) and what it recorded. ``plan`` is the plan as anchored.
 
     ``witness`` is what the sensor under the table said of the wrist's force, at the waypoints where it said anything.
+    ``deviation`` is the first that the law did not take in.
     """
 
     status: str
@@ -38,6 +39,7 @@ class TrialResult:
     plan: Plan
     waypoints: list[WaypointRecord] = field(default_factory=list)
     witness: list[Agreement] = field(default_factory=list)
+    deviation: Deviation | None = None
 
 
 @dataclass
@@ -115,8 +117,7 @@ class Trial:
         plan = self._anchored(go_air)
         self._result.plan = plan
         controller = self._make_controller(plan)
-        lies = None if controller.feedback else se2.between(go_air, self._go_seen)
-        monitor = ContactMonitor(plan, s.slip_tolerance_mm * 1e-3, s.force_limit, lies=lies)
+        monitor = ContactMonitor(plan, s.slip_tolerance_mm * 1e-3, s.force_limit)
 
         go_air = self._lifted(plan)
         ee_air = plan.free_air_ee(go_air)
@@ -145,7 +146,10 @@ class Trial:
             self._watch.waypoint(record)
             deviation = monitor.check(k, measured, weight)
             if deviation is not None:
-                raise _Ended(deviation.status, deviation.reason)
+                if self._taken_in(deviation, controller, measured if estimated is None else estimated):
+                    monitor.restart(k, measured)
+                else:
+                    self._deviates(deviation)
 
         self._watch.phase("unload", 0.0)
         path = [controller.command(go, ee) for go, ee in zip(plan.unload_go, plan.unload_ee, strict=True)]
@@ -160,7 +164,9 @@ class Trial:
         s, mover = self._settings, self._mover
         mover.ramp(controller.waypoint(k), s.ramp)
         self._settle()
-        for _ in range(s.corrections if controller.feedback else 0):
+        # an update moves what slips, and it does not slip back
+        updates = min(s.corrections, 1) if slips(plan) else s.corrections
+        for _ in range(updates if controller.feedback else 0):
             controller.in_contact(k, self._observer.estimate())
             self._tell_slip()
             mover.ramp(controller.waypoint(k), s.ramp)
@@ -169,6 +175,26 @@ class Trial:
         measured = self._observer.measure()
         self._hear_witness(k, measured)
         return measured, mover.pose, estimated, self._observer.contact()
+
+    def _taken_in(self, found: Deviation, controller: Controller, told: PlanarState) -> bool:
+        """Whether the law, asked with what it is ``told`` of this instant, goes on. After a refusal nobody asks."""
+        asks = self._result.deviation is None and found.status not in ("stopped", "diverged")
+        if not asks or not controller.replan(found.step, told, found):
+            return False
+        self._watch.event("warning", f"{found.reason}; {controller.name} has taken it in and goes on")
+        return True
+
+    def _deviates(self, found: Deviation) -> None:
+        """End the trial for a deviation, or record the first one where the settings say so."""
+        result = self._result
+        first = result.deviation is None
+        if first:
+            result.deviation = found
+        if found.status in ("stopped", "diverged") or self._settings.on_deviation == "end":
+            raise _Ended(found.status, found.reason)
+        if first:
+            result.status, result.reason = found.status, found.reason
+            self._watch.event("warning", f"{found.reason}; the trial goes on")
 
     def _hear_witness(self, k: int, measured: PlanarState) -> None:
         found = self._observer.second_opinion(measured)
@@ -204,6 +230,11 @@ class Trial:
         It is anchored to the table and, along it, to the extrinsic object.
         """
         bodies = ("table", "go") if self._nominal.eo is None else ("table", "go", "eo")
+        if not self._observer.tags.get("go"):
+            bodies = tuple(body for body in bodies if body != "go")
+            self._watch.event(
+                "warning", "the grasped object carries no tag: how it lies in the fingers is not verified"
+            )
         seen = self._observer.see(bodies)
         problem = self._start_problem(seen, go_expected)
         if problem is not None and self._watch.reset_scene(problem):
@@ -211,18 +242,18 @@ class Trial:
             problem = self._start_problem(seen, go_expected)
         if problem is not None:
             raise _Ended("stopped", f"the start could not be verified: {problem}")
-        table, go = seen["table"], seen["go"]
-        assert table is not None and go is not None  # _start_problem saw both
-        self._go_seen = go.pose
-        self._observer.zero(self._load, go.pose)
-        eo = seen.get("eo")
+        table, go, eo = (seen.get(body) for body in ("table", "go", "eo"))
+        assert table is not None  # _start_problem saw it
+        self._observer.zero(self._load, go_expected if go is None else go.pose)
         return anchored(self._nominal, table.pose, None if eo is None else eo.pose)
 
     def _start_problem(self, seen: dict, go_expected: Array) -> str | None:
         for body, pose in seen.items():
             if pose is None:
                 return f"no tag of '{body}' is in view"
-        problem = self._astray("the grasped object", "the grasp should have it", seen["go"].pose, go_expected)
+        problem = None
+        if "go" in seen:
+            problem = self._astray("the grasped object", "the grasp should have it", seen["go"].pose, go_expected)
         lies = resting_eo(self._nominal)
         if problem is None and lies is not None:
             on_table = se2.between(seen["table"].pose, seen["eo"].pose)

@@ -16,6 +16,9 @@ class WorldConfig(Strict):
 
     profile: str = "ideal"
     stiffness_scale: float = Field(default=1.0, gt=0, description="the plant's stiffness over the planner's")
+    friction_scale: dict[Literal["go-ground", "go-eo", "eo-ground"], Annotated[float, Field(gt=0, le=10)]] = Field(
+        default_factory=dict, description="the plant's friction over what it was when it was calibrated, by pair"
+    )
     clock: Literal["lockstep", "realtime"] = "lockstep"
     timestep: float = Field(default=0.001, gt=0, le=0.002, description="plant step [s]")
     faults: tuple[Fault, ...] = Field(default=(), description="what goes wrong, counted from each reset")

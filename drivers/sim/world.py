@@ -95,6 +95,7 @@ class World:
         except InputError as error:
             raise ValueError(str(error)) from None
         self._stiffness_scale = world.stiffness_scale
+        self._friction_scale: dict[str, float] = dict(world.friction_scale)  # type: ignore[arg-type]
         self._faults = world.faults
 
     # -- Clock ---------------------------------------------------------------------------------------------------
@@ -175,14 +176,14 @@ class World:
         """
         scene = scene if isinstance(scene, Scene) else Scene.model_validate(scene)
         self._need_life("reset")
-        before = self.profile, self._stiffness_scale, self._faults, self.lab
+        before = self.profile, self._stiffness_scale, self._friction_scale, self._faults, self.lab
         if world is not None:
             self._set_world(world)
         self.lab = Lab(self.profile, seed)
         try:
             plant = self._plant_of(scene)
         except (ValueError, DeviceFault):
-            self.profile, self._stiffness_scale, self._faults, self.lab = before
+            self.profile, self._stiffness_scale, self._friction_scale, self._faults, self.lab = before
             raise
         self._plant, self.scene, self.seed = plant, scene, seed
         self._steps = self._owed_ns = 0
@@ -210,11 +211,14 @@ class World:
         return scene.model_copy(update=changed)
 
     def _true_friction(self, scene: Scene) -> dict[str, float]:
-        """The coefficients of this lab. A body keeps its own by its name, whichever role it has: an eo that is held."""
+        """The coefficients of this lab. A body keeps its own by its name, whichever role it has: an eo that is held.
+
+        What has changed since they were found goes by the roles of the scene.
+        """
         held, met = scene.grasped.name, "eo" if scene.extrinsic is None else scene.extrinsic.name
         of_pair = {"go-ground": f"{held}-ground", "go-eo": f"{held}-{met}", "eo-ground": f"{met}-ground"}
         true = self.lab.friction({of_pair.get(pair, pair): mu for pair, mu in scene.friction.items()})
-        return {pair: true[of_pair.get(pair, pair)] for pair in scene.friction}
+        return {pair: true[of_pair.get(pair, pair)] * self._friction_scale.get(pair, 1.0) for pair in scene.friction}
 
     def regrasp(self, trial: int) -> None:
         """Take the go into the fingers anew, as between trials, and draw what no calibration removes.

@@ -54,13 +54,14 @@ class Target(BaseModel):
 
 
 class Targets(BaseModel):
-    """The whole file: benchmark → figure → target."""
+    """The whole file: benchmark → figure → target, and for `extrinsic table` table → finding → target."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     sim: dict[str, Target]
     estimation: dict[str, Target]
     planning: dict[str, Target]
+    tables: dict[str, dict[str, Target]] = {}
 
 
 def targets_of(benchmark: str) -> dict[str, Target]:

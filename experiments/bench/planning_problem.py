@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -44,21 +43,6 @@ def pivoting_pentagon(steps: int, form: Form) -> Problem:
     return skill.task(parameters, scene, form=form, weights=LossWeights()).problem
 
 
-def window(problem: Problem, begin: int, steps: int) -> Problem:
-    """``steps`` steps of a problem from ``begin`` on."""
-    cut = slice(begin, begin + steps)
-
-    def of(thing: Any, *names: str) -> dict[str, Any]:
-        return {name: getattr(thing, name)[cut] for name in names}
-
-    return replace(
-        problem,
-        **of(problem, "eo", "angle", "travel", "free", "angle_limits"),
-        contacts=tuple(replace(contact, **of(contact, "modes", "wish")) for contact in problem.contacts),
-        ground=tuple(replace(contact, **of(contact, "modes")) for contact in problem.ground),
-    )
-
-
 def disturbed(problem: Problem, objective: Objective, rng: np.random.Generator, away: float = AWAY) -> Array:
     """z (K, 5) off the nominal trajectory by ``away`` (1σ) in every free variable, where the loss is finite."""
     for _ in range(1000):
@@ -71,11 +55,6 @@ def disturbed(problem: Problem, objective: Objective, rng: np.random.Generator, 
 def regrasped(problem: Problem, rng: np.random.Generator) -> Problem:
     """The problem with the grasp where an estimator may have it next."""
     return replace(problem, grasp=np.asarray(problem.grasp) + GRASP_NOISE * rng.standard_normal(3))
-
-
-def shifted(z: Array) -> Array:
-    """z (K, D) one step further on: the last step stands twice."""
-    return np.concatenate([z[1:], z[-1:]])
 
 
 def described(problem: Problem) -> str:

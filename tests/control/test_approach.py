@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from control.approach import anchored, resting_eo, retreat
-from control.monitor import ContactMonitor
 from mechanics import se2
 from mechanics.friction import Mode
-from mechanics.records import PlanarState
 
 
 @pytest.fixture
@@ -62,25 +60,3 @@ def test_a_plan_stands_where_its_object_does_at_the_tables_height_and_angle(push
     assert moved is not None
     np.testing.assert_allclose(moved[2], where[2], atol=1e-12)
     np.testing.assert_allclose(moved[:2], where[:2] + 0.003 * np.array([np.cos(0.01), np.sin(0.01)]), atol=1e-12)
-
-
-def measured(pushing, go=(0.0, 0.0, 0.0), eo=(0.0, 0.0, 0.0)):
-    """What is measured with go and eo moved by so much from where the plan has them."""
-    wrench = pushing.wrench[0].copy()
-    return PlanarState(pushing.ee[0], pushing.go[0] + go, pushing.eo[0] + eo, wrench)
-
-
-def test_two_objects_that_move_together_have_not_slipped_on_each_other(pushing):
-    monitor = ContactMonitor(
-        replace(pushing, contact_modes=((Mode.STICK, Mode.SLIP_NEGATIVE),) * pushing.steps), 5e-3, 30
-    )
-    together = measured(pushing, (0.01, 0.0, 0.0), (0.01, 0.0, 0.0))
-    assert monitor.check(0, together, np.zeros(2)) is None
-    found = monitor.check(0, measured(pushing, (0.0, 0.01, 0.0)), np.zeros(2))
-    assert found is not None and "'object' is 10.0 mm" in found.reason
-
-
-def test_an_object_that_slides_away_from_its_pivot_has_slipped(pushing):
-    monitor = ContactMonitor(pushing, 5e-3, 30)
-    found = monitor.check(0, measured(pushing, (0.006, 0, 0), (0.006, 0.0, 0.0)), np.zeros(2))
-    assert found is not None and found.status == "slipped" and "'ground left' is 6.0 mm" in found.reason

@@ -1,11 +1,13 @@
 """The trial protocol on the simulated station in this process: what it does, and how it ends when things go wrong."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from control.base import Controller
 from control.closed_loop import ClosedLoop
 from control.observe import Observer
 from control.open_loop import OpenLoop
@@ -20,6 +22,7 @@ from experiments.files import load
 from experiments.planning.make import make
 from mechanics.camera import CameraModel
 from mechanics.records import WaypointRecord
+from planning.plan import Plan
 
 STEPS = 3
 
@@ -56,7 +59,7 @@ class Station:
             window_ns=100_000_000,
         )
 
-    def run(self, controller=OpenLoop, observer=None, **settings):
+    def run(self, controller: Callable[[Plan], Controller] = OpenLoop, observer=None, **settings):
         watch = Watch(
             waypoint=self.waypoints.append,
             phase=lambda name, _: self.phases.append(name),

@@ -306,3 +306,11 @@ def test_gripper_reports_what_it_holds(world):
     assert not gripper.latest().holding, "the go has fallen out of reach"
     with pytest.raises(CommandRefused, match="force"):
         gripper.grasp(-1.0)
+
+
+def test_friction_can_have_changed_since_the_laboratory_was_calibrated(world, make_scene):
+    scene = make_scene()
+    world.reset(0, scene, WorldConfig(friction_scale={"go-ground": 0.9}))
+    assert world._actual(world.scene).friction == pytest.approx(
+        scene.friction | {"go-ground": 0.9 * scene.friction["go-ground"]}
+    )
