@@ -10,6 +10,11 @@ from drivers.fault import Fault
 from drivers.scene import Strict, TagMount, Vector3
 from mechanics.yaml_input import Refusal
 
+#: after this long without a sign of life somebody counts as dead [s]: ten seconds are too many beside an arm
+LEASE = 1.0
+#: in lockstep nothing moves meanwhile, and a crowded machine may keep a process waiting for longer than one
+LEASE_IN_LOCKSTEP = 10.0
+
 
 class WorldConfig(Strict):
     """The simulated world. ``profile`` names the mismatch between the plant and what the planner believes of it."""
@@ -29,6 +34,12 @@ class BusConfig(Strict):
 
     endpoint: str = Field(default="tcp/127.0.0.1:7447", pattern=r"^(tcp|tls)/.+:\d+$")
     timeout: float = Field(default=5.0, gt=0, description="longest wait for a reply [s]")
+    lease: float | None = Field(
+        default=None,
+        gt=0,
+        le=60,
+        description="who is silent for so long counts as dead [s]; 1 by default, 10 in lockstep, where nothing moves",
+    )
 
 
 class _Device(Strict):
@@ -111,6 +122,13 @@ class StationConfig(Strict):
     devices: dict[str, DeviceConfig]
     table_tags: tuple[TagMount, ...] = ()
     log: LogConfig = LogConfig()
+
+    @property
+    def lease(self) -> float:
+        """How long somebody on the bus may be silent before they count as dead [s]."""
+        if self.bus.lease is not None:
+            return self.bus.lease
+        return LEASE_IN_LOCKSTEP if self.world is not None and self.world.clock == "lockstep" else LEASE
 
     @model_validator(mode="after")
     def _faults_suit(self) -> Self:

@@ -35,7 +35,7 @@ HOST_START = 20.0
 
 _HERE = str(Path(__file__).resolve().parent.parent)
 _PROBE = 1.0
-_HOST_STOP = 3.0
+_HOST_STOP = 10.0
 _PROTOCOL = 1
 
 log = logging.getLogger(__name__)
@@ -171,7 +171,7 @@ class Connection:
                     "Start the station with `extrinsic serve STATION`, or correct bus.endpoint",
                 )
             self.host = stack.enter_context(HostProcess(config))
-        bus = stack.enter_context(Bus(endpoint, timeout=config.bus.timeout, shared_memory=False))
+        bus = stack.enter_context(Bus(endpoint, timeout=config.bus.timeout, shared_memory=False, lease=config.lease))
         watch = bus.watch(topics.alive(config.name, topics.WORLD))
         stack.callback(self._abandon, watch)
         if not watch.seen(config.bus.timeout):

@@ -38,7 +38,7 @@ def station_status(config: StationConfig, seconds: float = 1.0) -> list[DeviceSt
     if not listening(endpoint):
         note = f"nothing listens at {endpoint}"
         return [DeviceStatus(name, d.kind, d.backend, False, note=note) for name, d in config.devices.items()]
-    with Bus(endpoint, timeout=config.bus.timeout, shared_memory=False) as bus:
+    with Bus(endpoint, timeout=config.bus.timeout, shared_memory=False, lease=config.lease) as bus:
         link = Link(bus, config.name)
         devices = {name: REMOTES[device.kind](name, link, False) for name, device in config.devices.items()}
         failures: dict[str, str] = {}

@@ -289,7 +289,9 @@ def _die() -> None:
 
 def serve(config: StationConfig, ready: Callable[[Host], None] = lambda _: None) -> int:
     """Serve a simulated station in this process until SIGTERM or SIGINT; returns 0. Raises NotConnected, ValueError."""
-    with Bus(config.bus.endpoint, listen=True, timeout=config.bus.timeout, shared_memory=False) as bus:
+    with Bus(
+        config.bus.endpoint, listen=True, timeout=config.bus.timeout, shared_memory=False, lease=config.lease
+    ) as bus:
         host = Host(config, bus)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: host.stop())

@@ -22,9 +22,6 @@ from drivers.wire import topics
 from drivers.wire.streams import Publisher, Subscription
 from drivers.wire.watch import Watch, undeclare, wait_matching
 
-LEASE = 1.0
-"""After this long without a sign of life the peer counts as gone [s]: zenoh's own ten are too many beside an arm."""
-
 _VERDICT = 0.5  # an empty answer and the news of a death come together, in either order [s]
 
 _open: weakref.WeakSet[Bus] = weakref.WeakSet()
@@ -55,8 +52,9 @@ class Query:
 class Bus:
     """A zenoh session as a context manager. ``endpoint`` is listened at (``listen``) or connected to.
 
-    ``mode``: ``peer`` on one machine, ``client`` toward a router. Raises NotConnected when the session cannot be
-    opened within ``timeout`` seconds.
+    ``mode``: ``peer`` on one machine, ``client`` toward a router. ``lease`` [s] is how long a peer may be silent, or
+    not take what it is sent, before it counts as dead; zenoh's own ten are too many beside an arm. Raises NotConnected when
+    the session cannot be opened within ``timeout`` seconds.
     """
 
     def __init__(
@@ -67,6 +65,7 @@ class Bus:
         mode: Literal["peer", "client"] = "peer",
         timeout: float = 5.0,
         shared_memory: bool = True,
+        lease: float = 1.0,
     ):
         self.endpoint, self.timeout = endpoint, timeout
         self._subscriptions: dict[str, Subscription] = {}
@@ -83,9 +82,9 @@ class Bus:
             "connect/endpoints": [] if listen else [endpoint],
             "connect/timeout_ms": int(timeout * 1000),
             "connect/exit_on_failure": True,
-            "transport/unicast/open_timeout": int(2 * LEASE * 1000),
-            "transport/link/tx/lease": int(LEASE * 1000),
-            "transport/link/tx/queue/congestion_control/block/wait_before_close": int(LEASE * 1e6),
+            "transport/unicast/open_timeout": int(2 * lease * 1000),
+            "transport/link/tx/lease": int(lease * 1000),
+            "transport/link/tx/queue/congestion_control/block/wait_before_close": int(lease * 1e6),
             "transport/shared_memory/enabled": shared_memory,
         }
         config = zenoh.Config()

@@ -164,7 +164,7 @@ def read(file: Path) -> Calibration:
 
 
 def load(resolved: Resolved) -> Calibrations:
-    """The calibrations that the experiment may use, by its `calibration` key.
+    """The calibrations that the experiment may use, by its `calibration` key; a folder that it fills may be missing.
 
     Raises InputError that names each file which is of another station, device or object, or too old.
     """
@@ -174,7 +174,8 @@ def load(resolved: Resolved) -> Calibrations:
         return found
     folder = folder_of(resolved)
     if not folder.is_dir():
-        if use.source != "auto":
+        makes_it = any(stage.stage.startswith("calibrate_") for stage in resolved.experiment.stages)
+        if use.source != "auto" and not makes_it:
             wrong = f"there is no folder {folder}"
             expected = "auto, none, or a folder of calibration files"
             raise InputError([resolved.experiment_document.problem(("calibration", "source"), wrong, expected)])

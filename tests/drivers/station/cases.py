@@ -24,7 +24,7 @@ def station(clock: str = "lockstep", **devices: Any) -> StationConfig:
         {
             "name": "sim",
             "world": {"clock": clock},
-            "bus": {"endpoint": f"tcp/127.0.0.1:{port}", "timeout": 5.0},
+            "bus": {"endpoint": f"tcp/127.0.0.1:{port}", "timeout": 5.0, "lease": 1.0},
             "devices": kinds | devices,
         }
     )
