@@ -53,8 +53,8 @@ class Bus:
     """A zenoh session as a context manager. ``endpoint`` is listened at (``listen``) or connected to.
 
     ``mode``: ``peer`` on one machine, ``client`` toward a router. ``lease`` [s] is how long a peer may be silent, or
-    not take what it is sent, before it counts as dead; zenoh's own ten are too many beside an arm. Raises NotConnected when
-    the session cannot be opened within ``timeout`` seconds.
+    not take what it is sent, before it counts as dead; zenoh's own ten seconds are too many beside an arm. Raises
+    NotConnected when the session cannot be opened within ``timeout`` seconds.
     """
 
     def __init__(
