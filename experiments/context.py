@@ -23,6 +23,7 @@ from experiments.progress import Progress
 from experiments.run_folder import RunFolder, write_json
 from mechanics.records import EventRecord, PhaseRecord, TrialRecord, WaypointRecord
 from planning.plan import Plan
+from planning.skills.base import SkillTask
 
 #: the streams have spoken before the first stage needs them [s]
 WARM_UP = 0.2
@@ -49,6 +50,8 @@ class RunContext:
         self.folder, self.results, self.log, self.progress = folder, results, log, progress
         self.settings: TrialSettings = resolved.experiment.trial
         self.plans: dict[str, Plan] = {}
+        #: what the plans of this run's plan stages were made of
+        self.tasks: dict[str, SkillTask] = {}
         self.calibrations = calibrations
         self.holder = f"run-{socket.gethostname()}-{os.getpid()}"
         self.ask, self.check_interrupt = ask, check_interrupt

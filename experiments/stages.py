@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -15,7 +14,7 @@ from control.observe import Finger
 from control.trial import Trial, TrialResult, Watch
 from drivers.errors import DeviceTimeout, DriverError, SimulationDiverged
 from drivers.station import Devices
-from experiments import registries, setup
+from experiments import kernels, registries, setup
 from experiments.arrange import arrange, hold
 from experiments.context import RunContext
 from experiments.metrics import contact_of, errors_of, witness_of
@@ -36,6 +35,8 @@ def execute_stage(context: RunContext, stage: ExecuteStage) -> None:
     if stage.from_file:
         take_plan_files(context)
     plan = context.plans[stage.plan]
+    if stage.restiffen:
+        plan = plan.with_stiffness(context.believed.stiffness)
     devices = context.devices()
     _warm_up(context, stage)
     with devices.arm.lease(context.holder), context.timed(devices):
@@ -60,6 +61,8 @@ def _warm_up(context: RunContext, stage: ExecuteStage) -> None:
             except DriverError:  # the trial will meet it again, and name it
                 break
     setup.warm_up(context.resolved, context.believed, fingers)
+    if any(registries.controllers()[name].needs_task for name in stage.controllers):
+        kernels.warm()
 
 
 def _one_trial(
@@ -69,6 +72,13 @@ def _one_trial(
     begin = TrialRecord(devices.clock.now_ns(), name, plan.skill, controller.name)
     context.write(begin)
     waypoints: list[WaypointRecord] = []
+    laws: list[Controller] = []
+
+    def made(anchored: Plan) -> Controller:
+        given: dict[str, Any] = {"task": context.tasks[plan.name]} if controller.needs_task else {}
+        laws.append(controller(anchored, settings=law, **given))
+        return laws[-1]
+
     with context.progress.steps(f"{controller.name} {trial + 1}", len(plan.ee)) as advance:
 
         def on_waypoint(record: WaypointRecord) -> None:
@@ -96,13 +106,15 @@ def _one_trial(
             fingers = context.fingers() if controller.feedback else ()  # nobody else asks where the go is
             observer = setup.observer(there, devices, context.settings, context.believed, fingers)
             arrange(context, devices, observer, plan, trial)
-            made = partial(controller, settings=law)
             result = Trial(name, plan, made, observer, clock, load, context.settings, watch).run()
         except SimulationDiverged as error:
             result = TrialResult("diverged", str(error), plan)
         except DriverError as error:  # before the protocol began
             result = TrialResult("device_failed", str(error), plan)
-    context.results["trials"].append(_row(context, name, controller, trial, result, waypoints))
+    row = _row(context, name, controller, trial, result, waypoints)
+    if laws and (told := laws[-1].told()) is not None:
+        row["law"] = told
+    context.results["trials"].append(row)
     end = replace(begin, status=result.status, reason=result.reason, plan=json.dumps(result.plan.to_dict()))
     context.write(replace(end, capture_ns=context.now_ns()))
     context.save()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments import registries
 from experiments.files import Resolved
 from experiments.schema import PLAN_FILE, ExecuteStage
 from mechanics.yaml_input import InputError
@@ -21,9 +22,20 @@ def plan_files(resolved: Resolved) -> dict[str, Plan]:
     """The plans that execute stages take from files, by what stands there. Raises InputError, at that stage."""
     found: dict[str, Plan] = {}
     for i, stage in enumerate(resolved.experiment.stages):
-        if isinstance(stage, ExecuteStage) and stage.from_file and stage.plan not in found:
-            found[stage.plan] = _read(resolved, i, stage.plan)
+        if isinstance(stage, ExecuteStage) and stage.from_file:
+            _refuse_laws_that_plan(resolved, i, stage)
+            if stage.plan not in found:
+                found[stage.plan] = _read(resolved, i, stage.plan)
     return found
+
+
+def _refuse_laws_that_plan(resolved: Resolved, i: int, stage: ExecuteStage) -> None:
+    """A file has the plan alone, not what it was made of."""
+    for n, name in enumerate(stage.controllers):
+        if registries.controllers()[name].needs_task:
+            wrong = f"{name} re-plans: it needs a plan stage in this experiment, not a plan from a file"
+            expected = f"`plan:` that names a plan stage of this experiment, or controllers without {name}"
+            raise InputError([resolved.experiment_document.problem(("stages", i, "controllers", n), wrong, expected)])
 
 
 def _read(resolved: Resolved, i: int, name: str) -> Plan:

@@ -69,14 +69,17 @@ def objective(backend: str) -> Callable[[Problem], Any]:
     return lambda problem: TorchObjective(problem, backend)
 
 
-def make(resolved: Resolved, stage: PlanStage, known: Believed) -> Plan:
-    """The plan of a stage; the same seed gives the same plan. Raises InfeasiblePlan and ValueError."""
+def make(resolved: Resolved, stage: PlanStage, known: Believed, made_of: SkillTask | None = None) -> Plan:
+    """The plan of a stage, ``made_of`` its `task`; the same seed gives the same plan.
+
+    Raises InfeasiblePlan and ValueError.
+    """
     from planning.planner import plan
 
     rng = np.random.default_rng([resolved.experiment.seed, crc32(stage.name.encode())])
     asked = stage.model_dump(mode="json", include={"parameters", "backend", "limits"})
     return plan(
-        task(resolved, stage, known),
+        task(resolved, stage, known) if made_of is None else made_of,
         stage.name,
         optimiser=stage.make_optimiser(),
         objective=objective(stage.backend),

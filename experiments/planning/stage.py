@@ -8,7 +8,7 @@ from typing import Any
 from experiments import kernels
 from experiments.context import RunContext
 from experiments.planning.files import plan_files, save_plan
-from experiments.planning.make import make
+from experiments.planning.make import make, task
 from experiments.planning.schema import PlanStage
 from planning.plan import Plan
 
@@ -20,9 +20,10 @@ def plan_stage(context: RunContext, stage: PlanStage) -> None:
             kernels.warm()
     begin = time.perf_counter()
     with context.progress.step(f"plan {stage.name}"):
-        made = make(context.resolved, stage, context.believed)
+        asked = task(context.resolved, stage, context.believed)
+        made = make(context.resolved, stage, context.believed, asked)
     took = time.perf_counter() - begin
-    context.plans[stage.name] = made
+    context.plans[stage.name], context.tasks[stage.name] = made, asked
     file = save_plan(made, context.folder.path)
     how = {"optimiser": stage.optimiser["name"], "backend": stage.backend, "form": stage.form}
     context.results["plans"].append({**_row(made, file), **how, "time_s": took})

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from experiments.bench import main
 from experiments.bench.figures import Figure, targets_of
-from experiments.bench.planning_problem import described, pivoting_pentagon, regrasped, shifted, window
+from experiments.bench.planning_problem import described, pivoting_pentagon, regrasped
 from experiments.bench.planning_table import side_by_side
 from experiments.bench.planning_timing import Watched, apart, repeated
 from mechanics.yaml_input import InputError
@@ -25,22 +25,6 @@ def test_the_pentagon_is_turned_by_25_degrees_at_every_horizon(steps, form):
     assert problem.steps == steps and problem.form is form
     np.testing.assert_allclose(np.degrees(problem.eo[[0, -1], 2]), [-0.3, -25.0])
     assert f"{form.value} form" in described(problem)
-
-
-def test_a_window_is_the_problem_from_one_step_to_another():
-    long = pivoting_pentagon(12, Form.CLOSED)
-    cut = window(long, 3, 5)
-    assert cut.steps == 5
-    for name in ("eo", "angle", "travel", "free", "angle_limits"):
-        np.testing.assert_array_equal(getattr(cut, name), getattr(long, name)[3:8])
-    np.testing.assert_array_equal(cut.contacts[0].wish, long.contacts[0].wish[3:8])
-    assert all(len(contact.modes) == 5 for contact in (*cut.contacts, *cut.ground))
-    np.testing.assert_array_equal(cut.stiffness, long.stiffness)
-
-
-def test_a_plan_moves_on_by_a_step_and_ends_with_its_last_one_twice():
-    z = np.arange(15.0).reshape(3, 5)
-    np.testing.assert_array_equal(shifted(z), [z[1], z[2], z[2]])
 
 
 def test_a_grasp_that_is_estimated_anew_is_near_the_old_one():
