@@ -165,6 +165,54 @@ def bench(
     raise typer.Exit(benchmarks.main(name, runs, json_file, out, check_targets, _horizons(horizons)))
 
 
+@command("extrinsic sweep grasped_static --grid world.stiffness_scale=0.8,1,1.2 --seeds 0-4 --set world.profile=lab")
+def sweep(
+    experiment: Experiment,
+    grid: Annotated[
+        list[str] | None,
+        typer.Option("--grid", metavar="KEY=A,B,...", help="Run with each of these values of a key."),
+    ] = None,
+    seeds: Annotated[
+        str | None, typer.Option("--seeds", metavar="0-4", help="Run with each of these seeds: 0-4, or 0,3,7.")
+    ] = None,
+    station: StationOption = None,
+    sets: Sets = None,
+    workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes on this machine; 2.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of a Dask scheduler.")
+    ] = None,
+    retries: Annotated[
+        int, typer.Option("--retries", min=0, help="So often a job runs again whose worker or device failed.")
+    ] = 2,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="The sweep's folder; one that was cut off goes on.")
+    ] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the summary as JSON.")] = None,
+) -> None:
+    """Run every combination of a grid, every seed and trial, on workers; one table of all trials."""
+    from experiments.campaign.sweep import sweep as run_sweep
+    from mechanics.yaml_input import InputError, Problem
+
+    if workers is not None and scheduler is not None:
+        wrong, expected = "the scheduler has workers of its own", "--workers or --scheduler"
+        raise InputError([Problem("sweep", None, "--workers", wrong, expected)])
+    code = run_sweep(
+        experiment,
+        station,
+        sets or [],
+        grid or [],
+        seeds,
+        workers=workers or 2,
+        scheduler=scheduler,
+        retries=retries,
+        out=out,
+        json_file=json_file,
+        console=Console(),
+        said=Console(stderr=True),
+    )
+    raise typer.Exit(code)
+
+
 def _horizons(text: str | None) -> tuple[int, ...] | None:
     """Numbers of steps. Raises InputError for anything else."""
     from mechanics.yaml_input import InputError, Problem
@@ -176,6 +224,39 @@ def _horizons(text: str | None) -> tuple[int, ...] | None:
         wrong, expected = f"{text!r} are no horizons", "whole numbers of steps, such as 40,200,1000"
         raise InputError([Problem("bench", None, "--horizons", wrong, expected)])
     return tuple(dict.fromkeys(int(word) for word in words))
+
+
+@command("extrinsic table pivoting --seed 1 --check")
+def table(
+    name: Annotated[
+        str, typer.Argument(metavar="TABLE", help="grasped, extrinsic, pivoting, optimizers, or a table file.")
+    ],
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulated laboratory and its trials.")] = 0,
+    trials: Annotated[
+        int | None, typer.Option("--trials", metavar="N", min=1, help="A part: so many trials of each trajectory.")
+    ] = None,
+    runs: Annotated[str | None, typer.Option("--runs", metavar="RUN,...", help="A part: these runs only.")] = None,
+    sets: Sets = None,
+    workers: Annotated[int, typer.Option("--workers", min=1, help="Jobs at a time on this machine.")] = 2,
+    scheduler: Annotated[
+        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, tcp://host:port.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="The table's folder; one begun goes on.")
+    ] = None,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write table.json there, too.")
+    ] = None,
+    check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
+) -> None:
+    """Run a table of the paper: calibrate, run its trials, print our figures beside the paper's."""
+    from experiments.table import run as tables
+    from experiments.table.jobs import Options
+
+    chosen = () if runs is None else tuple(word.strip() for word in runs.split(","))
+    options = Options(seed, trials, chosen, tuple(sets or ()))
+    engine = tables.Engine(workers=workers, scheduler=scheduler)
+    raise typer.Exit(tables.main(name, options, engine, out, json_file, check_targets))
 
 
 def _check_packages() -> str | None:

@@ -75,6 +75,10 @@ class ExecuteStage(_Model):
     plan: Annotated[str, _NAME]
     controllers: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_known_controllers)]
     settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    restiffen: bool = Field(
+        default=False,
+        description="end-effector poses anew, from the go's and the forces, by the stiffness believed here",
+    )
     trials: int = Field(default=1, ge=1, le=10_000)
     first: int = Field(default=0, ge=0, le=1_000_000, description="number of the first trial: the grasp is drawn by it")
 

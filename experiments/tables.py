@@ -38,6 +38,8 @@ def error_table(results: dict[str, Any]) -> Table:
     paper = beside(results["trials"])["rows"]
     for (skill, controller), group in groups.items():
         printed = paper.get(group[0]["name"])
+        if printed is not None and not set(printed) & set(figures):  # the paper has components alone
+            printed = None
         if len(group) == 1 and printed is None:
             continue
         table.add_section()

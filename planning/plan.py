@@ -118,6 +118,19 @@ class Plan:
         carried = -gravity_wrench(self.mass, arm, self.gravity)
         return Elasticity(self.stiffness).ee_pose(X_W_go, self.X_go_gocf, carried)
 
+    def with_stiffness(self, stiffness: Array) -> Self:
+        """Return the plan for a finger of ``stiffness`` (3, 3) [N/m, N, N·m/rad] in gocf.
+
+        The go's poses and every force stay; the end-effector follows from them, ee = go ⊕ X_go_gocf ⊕ K⁻¹ w, on the
+        ramps too. Raises ValueError unless K is symmetric positive definite.
+        """
+        finger = Elasticity(np.asarray(stiffness, dtype=np.float64))
+        moved = {
+            f"{part}ee": finger.ee_pose(getattr(self, f"{part}go"), self.X_go_gocf, getattr(self, f"{part}wrench"))
+            for part in ("", "preload_", "unload_")
+        }
+        return replace(self, stiffness=finger.stiffness, **moved)
+
     def reanchored(self, X_W_table: Array) -> Self:
         """Return the plan for a table whose frame sits at ``X_W_table`` (3,) where this plan's table sits at identity.
 

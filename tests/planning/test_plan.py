@@ -114,3 +114,35 @@ def test_reanchoring_there_and_back_changes_nothing(p):
     back = p.reanchored(table).reanchored(se2.inverse(table))
     for name in ("ee", "go", "wrench", "contact_points", "contact_normals", "preload_wrench"):
         np.testing.assert_allclose(getattr(back, name), getattr(p, name), atol=1e-14)
+
+
+@pytest.mark.parametrize("skill", ["grasped_sliding", "extrinsic_pivoting"])
+def test_a_plan_taken_to_other_fingers_is_the_plan_that_would_have_been_made_for_them(skill, scene_of, statics):
+    scene = scene_of("tall_box" if SKILLS[skill].needs_extrinsic else None)
+    stiff = scene.held.stiffness @ np.diag([3.0, 5.0, 0.2])
+    stiff = (stiff + stiff.T) / 2
+    parameters = SKILLS[skill].Parameters()
+    soft_plan = plan(SKILLS[skill].task(parameters, scene), "p")
+    stiffer = replace(scene, held=replace(scene.held, stiffness=stiff))
+    made = plan(SKILLS[skill].task(parameters, stiffer), "p")  # the nominal trajectory knows no stiffness
+    taken = soft_plan.with_stiffness(stiff)
+    assert np.abs(taken.ee - soft_plan.ee).max() > 2e-4
+    for field in fields(made):
+        ours, theirs = getattr(taken, field.name), getattr(made, field.name)
+        if isinstance(theirs, np.ndarray):
+            np.testing.assert_allclose(ours, theirs, atol=1e-12, err_msg=field.name)
+    for part in ("", "preload_", "unload_"):
+        go, ee, wrench = (getattr(taken, f"{part}{name}") for name in ("go", "ee", "wrench"))
+        felt = statics.sensor_wrench(stiff, go[-1], taken.X_go_gocf, ee[-1])
+        np.testing.assert_allclose(felt, wrench[-1], atol=1e-9)
+
+
+def test_a_plan_taken_to_its_own_fingers_stays_as_it_is(p):
+    taken = p.with_stiffness(p.stiffness)
+    for name in ("ee", "preload_ee", "unload_ee"):
+        np.testing.assert_allclose(getattr(taken, name), getattr(p, name), atol=1e-14)
+
+
+def test_a_plan_is_taken_to_no_finger_that_gives_way_without_limit(p):
+    with pytest.raises(ValueError, match="positive definite"):
+        p.with_stiffness(np.diag([1000.0, 1000.0, -1.0]))

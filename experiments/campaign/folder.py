@@ -1,0 +1,204 @@
+"""What a campaign leaves on disk, and what of it is there already: the truth about a campaign is its folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments.calibrate import store
+from experiments.campaign.jobs import Job, digest, planned_trials
+from experiments.files import Resolved, dump_resolved, load
+from experiments.planning.files import plan_files
+from experiments.run_folder import write_atomic, write_json
+from experiments.schema import ExecuteStage
+from mechanics.yaml_input import InputError, Problem
+from planning import plan_file
+
+#: a run with one of these has come to its end, and running it again would give the same
+ENDED = ("completed", "fell_short", "stopped", "infeasible")
+
+
+class JobFolder:
+    """``jobs/<id>/``: the experiment, frozen, and its runs ``run``, ``run.1``, … of which none is ever overwritten."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.experiment = path / "experiment.yaml"
+        self._failure = path / "failed.json"
+
+    def runs(self) -> list[Path]:
+        """Its run folders, oldest first."""
+        found = [path for path in self.path.glob("run*") if path.is_dir()]
+        return sorted(found, key=lambda path: int(path.suffix[1:] or 0))
+
+    def next_run(self) -> Path:
+        """A new run folder, made by nobody else."""
+        number = len(self.runs())
+        while True:
+            path = self.path / (f"run.{number}" if number else "run")
+            try:
+                path.mkdir()
+            except FileExistsError:
+                number += 1
+            else:
+                return path
+
+    def ended(self) -> tuple[Path, dict[str, Any]] | None:
+        """The newest run that came to its end, and its results."""
+        for run in reversed(self.runs()):
+            results = _results(run)
+            if results is not None and results["status"] in ENDED:
+                return run, results
+        return None
+
+    def newest(self) -> dict[str, Any] | None:
+        """The results of the newest run that has any, whole or not."""
+        return next((found for run in reversed(self.runs()) if (found := _results(run)) is not None), None)
+
+    @property
+    def failure(self) -> str | None:
+        """Why the job was given up, if it was."""
+        return json.loads(self._failure.read_text())["reason"] if self._failure.is_file() else None
+
+    def give_up(self, reason: str) -> None:
+        """Note why no more attempt is made."""
+        write_json(self._failure, {"reason": reason})
+
+    def try_again(self) -> None:
+        """Forget that it was given up."""
+        self._failure.unlink(missing_ok=True)
+
+
+def _results(run: Path) -> dict[str, Any] | None:
+    try:
+        return json.loads((run / "results.json").read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+
+
+class CampaignFolder:
+    """``campaign.json`` with what the campaign is, and ``jobs/<id>/`` for each of its jobs."""
+
+    def __init__(self, path: Path):
+        self.path = path.absolute()
+        self.campaign = self.path / "campaign.json"
+
+    def job(self, id: str) -> JobFolder:
+        """The folder of a job."""
+        return JobFolder(self.path / "jobs" / id)
+
+    def read(self) -> dict[str, Any]:
+        """What campaign.json says. Raises InputError where there is none."""
+        if not self.campaign.is_file():
+            raise InputError([Problem(str(self.path), None, "", "no campaign.json in it", "a sweep's folder")])
+        return json.loads(self.campaign.read_text(encoding="utf-8"))
+
+    def agree(self, jobs: Sequence[Job], resolved: Mapping[str, Resolved]) -> dict[str, Any]:
+        """What campaign.json says of these jobs, now or once `keep` has written it.
+
+        Raises InputError when the folder holds something else, or another campaign.
+        """
+        asked = _described(jobs, resolved)
+        if self.campaign.is_file():
+            if wrong := _difference(self.read()["jobs"], asked["jobs"]):
+                expected = "the same sweep, or another folder for this one"
+                raise InputError(
+                    [Problem(str(self.path), None, "--out", f"another sweep lies there: {wrong}", expected)]
+                )
+        elif self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir())):
+            wrong, expected = "there is something there already, and no sweep", "a new or an empty folder"
+            raise InputError([Problem(str(self.path), None, "--out", wrong, expected)])
+        return asked
+
+    def keep(self, asked: Mapping[str, Any], jobs: Sequence[Job], resolved: Mapping[str, Resolved]) -> None:
+        """Write what is not there yet: campaign.json, and each job's experiment with what it reads frozen beside it.
+
+        So the calibrations and the plan files that a campaign began with are those that it ends with, and a worker
+        needs no other folder than this one. Raises InputError when the folder cannot be written.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            if not self.campaign.is_file():
+                write_json(self.campaign, asked)
+            for job in jobs:
+                folder = self.job(job.id)
+                if not folder.experiment.is_file():
+                    folder.path.mkdir(parents=True, exist_ok=True)
+                    frozen = load(job.experiment, job.station, (*job.sets, *self._freeze(folder, resolved[job.id])))
+                    write_atomic(folder.experiment, dump_resolved(frozen))
+        except OSError as error:
+            wrong = f"cannot be written: {error.strerror}"
+            raise InputError([Problem(str(self.path), None, "--out", wrong, "a folder you may write to")]) from None
+
+    def _freeze(self, folder: JobFolder, resolved: Resolved) -> list[str]:
+        """Copy what the job reads; the sets that name the copies. A job that calibrates writes to a copy of its own."""
+        sets: list[str] = []
+        stages = resolved.experiment.stages
+        source = store.folder_of(resolved)
+        if any(stage.stage.startswith("calibrate") for stage in stages):
+            sets.append(_set("calibration.source", _copied(source, folder.path / "calibrations")))
+        elif resolved.experiment.calibration.source != "none" and source.is_dir():
+            sets.append(_set("calibration.source", _copied(source, self.path / "calibrations" / source.name)))
+        elif resolved.experiment.calibration.source == "auto":
+            sets.append(_set("calibration.source", "none"))  # what others calibrate meanwhile is not of this campaign
+        plans = plan_files(resolved)
+        for i, stage in enumerate(stages):
+            if isinstance(stage, ExecuteStage) and stage.from_file:
+                copy = folder.path / "plans" / Path(stage.plan).name
+                copy.parent.mkdir(exist_ok=True)
+                plan_file.save(plans[stage.plan], copy)
+                sets.append(_set(f"stages.{i}.plan", copy))
+        return sets
+
+
+def _set(key: str, value: object) -> str:
+    return f"experiment.{key}={json.dumps(str(value))}"
+
+
+def _copied(source: Path, target: Path) -> Path:
+    """``target``, a copy of the files in ``source`` made once, at once; an empty folder where there is no source."""
+    if not target.exists():
+        aside = target.with_name(f".{target.name}")
+        shutil.rmtree(aside, ignore_errors=True)
+        aside.mkdir(parents=True)
+        for file in source.glob("*.yaml"):
+            shutil.copy2(file, aside)
+        aside.replace(target)
+    return target
+
+
+def _described(jobs: Sequence[Job], resolved: Mapping[str, Resolved]) -> dict[str, Any]:
+    told = {
+        "schema": 1,
+        "experiment": resolved[jobs[0].id].experiment.name,
+        "jobs": [
+            {
+                "id": job.id,
+                "experiment": job.experiment,
+                "station": job.station,
+                "sets": list(job.sets),
+                "tags": dict(job.tags),
+                "resolved": digest(resolved[job.id]),
+                "trials": planned_trials(resolved[job.id]),
+            }
+            for job in jobs
+        ],
+    }
+    return json.loads(json.dumps(told, allow_nan=False))  # as it will be read: a tuple is a list there
+
+
+def _difference(there: Sequence[Mapping[str, Any]], asked: Sequence[Mapping[str, Any]]) -> str:
+    """The first difference between two campaigns' jobs in words; '' where there is none."""
+    known, wanted = {job["id"]: job for job in there}, {job["id"]: job for job in asked}
+    for id, job in wanted.items():
+        if id not in known:
+            return f"it has no job {id}"
+        if known[id]["tags"] != job["tags"]:
+            return f"its job {id} is {known[id]['tags']}, not {job['tags']}"
+        if known[id]["resolved"] != job["resolved"]:
+            return f"its job {id} has another experiment or station (jobs/{id}/experiment.yaml)"
+    more = [id for id in known if id not in wanted]
+    return f"it has a job {more[0]}, too" if more else ""

@@ -1,0 +1,143 @@
+"""The table of all trials of a campaign, and what it comes to: per cell of the grid and controller."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table
+
+from experiments.campaign.folder import CampaignFolder, JobFolder
+from experiments.run_folder import write_json
+from experiments.statistics import rate
+from experiments.tables import COLUMNS
+
+TRIALS, SUMMARY = "trials.parquet", "summary.json"
+#: what tells two methods apart within a cell of the grid
+METHOD = ("skill", "controller")
+
+
+def trials_frame(folder: Path) -> pd.DataFrame:
+    """One row for each trial of the jobs that have been run: ``job``, ``run`` (its folder), the tags, then the row of
+    results.json, its figures as ``measured.wrench_N.mean`` and so on.
+
+    A trial that its job did not get to has a row, too, with the job's status and reason. A tag with the name of
+    another column stands as ``grid.<name>``. Raises InputError where there is no campaign.
+    """
+    campaign = CampaignFolder(folder)
+    jobs = campaign.read()["jobs"]
+    rows = [row for job in jobs for row in _rows(campaign.path, campaign.job(job["id"]), job)]
+    if not rows:
+        return pd.DataFrame(columns=["job", "run", *METHOD, "trial", "status", "reason"])
+    frame = pd.json_normalize(rows, sep=".")
+    nested = {name for name in frame if any(other.startswith(f"{name}.") for other in frame)}
+    frame = frame.drop(
+        columns=[name for name in nested if not frame[name].dropna().size]
+    )  # where a trial had no figures
+    for name in frame.columns:
+        kinds = {type(value) for value in frame[name].dropna()}
+        if len(kinds) > 1 and not kinds <= {int, float}:  # a tag that is a figure in one cell and a word in another
+            frame[name] = frame[name].map(str, na_action="ignore")
+    return frame
+
+
+def _rows(root: Path, folder: JobFolder, job: Mapping[str, Any]) -> list[dict[str, Any]]:
+    ended, failure = folder.ended(), folder.failure
+    if ended is None and failure is None:
+        return []  # not run yet
+    runs = folder.runs()
+    run = ended[0] if ended is not None else (runs[-1] if runs else folder.path)
+    results = ended[1] if ended is not None else folder.newest()
+    trials = [] if results is None else results["trials"]
+    status, reason = ("failed", failure) if results is None or ended is None else (results["status"], results["reason"])
+    missing = [{**planned, "status": status, "reason": reason} for planned in job["trials"][len(trials) :]]
+    every = [*trials, *missing]
+    columns = {"job", "run"}.union(*every)
+    tags = {f"grid.{key}" if key in columns else key: value for key, value in job["tags"].items()}
+    return [{"job": job["id"], "run": str(run.relative_to(root)), **tags, **row} for row in every]
+
+
+def cells(folder: Path, frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """For each cell of the grid and method: ``n``, ``completed``, the share that completed with Wilson's 95 % interval,
+    and mean and spread over the trials of each error (`experiments.tables.COLUMNS`), as far as trials have it.
+
+    A trial's figure is its mean over the waypoints that it reached. Seeds are pooled.
+    """
+    named = dict.fromkeys(key for job in CampaignFolder(folder).read()["jobs"] for key in job["tags"])
+    keys = [column for key in named if (column := f"grid.{key}" if f"grid.{key}" in frame else key) in frame]
+    by = [*(key for key in keys if key != "seed"), *METHOD]
+    found: list[dict[str, Any]] = []
+    for _, group in frame.groupby(by, sort=False, dropna=False):
+        cell = {key: _plain(group[key].iloc[0]) for key in by}
+        completed = rate(group["status"].tolist().count("completed"), len(group))
+        figures = {name: _over(group, f"measured.{name}.mean") for name in COLUMNS}
+        found.append(
+            {
+                "cell": {key: cell[key] for key in by if key not in METHOD},
+                **{key: cell[key] for key in METHOD},
+                "n": completed.n,
+                "completed": completed.successes,
+                "success": {"rate": completed.share, "low": completed.low, "high": completed.high},
+                "measured": figures,
+            }
+        )
+    return found
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and np.isnan(value) else value
+
+
+def _over(group: pd.DataFrame, column: str) -> dict[str, float] | None:
+    known = group[column].dropna().to_numpy(float) if column in group else np.empty(0)
+    return {"mean": float(known.mean()), "std": float(known.std()), "n": len(known)} if len(known) else None
+
+
+def save(folder: Path, summary: Mapping[str, Any], frame: pd.DataFrame) -> None:
+    """Write ``trials.parquet`` and ``summary.json`` into the campaign's folder, each at once."""
+    aside = folder / f".{TRIALS}"
+    frame.to_parquet(aside, index=False)
+    aside.replace(folder / TRIALS)
+    write_json(folder / SUMMARY, summary)
+
+
+def summary_table(title: str, found: list[dict[str, Any]]) -> Table:
+    """The cells for a terminal."""
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    keys = list(dict.fromkeys(key for cell in found for key in cell["cell"]))
+    methods = ["controller"] if len({cell["skill"] for cell in found}) < 2 else list(METHOD)
+    for name in (*keys, *methods):
+        table.add_column(escape(name), overflow="fold")
+    table.add_column("n", justify="right")
+    table.add_column("completed", justify="right", no_wrap=True)
+    figures = [name for name in COLUMNS if any(cell["measured"][name] for cell in found)]
+    for name in figures:
+        table.add_column(escape(COLUMNS[name]), justify="right", no_wrap=True)
+    for cell in found:
+        success = cell["success"]
+        share = f"{success['rate']:.0%} ({success['low']:.0%}–{success['high']:.0%})"
+        table.add_row(
+            *(escape(_shown(cell["cell"][key])) for key in keys),
+            *(escape(_shown(cell[key])) for key in methods),
+            str(cell["n"]),
+            share,
+            *(_figure(cell["measured"][name]) for name in figures),
+            style=None if cell["completed"] == cell["n"] else "yellow",
+        )
+    return table
+
+
+def _shown(value: Any) -> str:
+    return "–" if value is None else value if isinstance(value, str) else json.dumps(value)
+
+
+def _figure(figure: Mapping[str, float] | None) -> str:
+    return "–" if figure is None else f"{figure['mean']:.3f} ± {figure['std']:.3f}"

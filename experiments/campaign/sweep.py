@@ -1,0 +1,102 @@
+"""The command `extrinsic sweep`: a grid of runs, their table, and an exit code."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pandas import DataFrame
+from rich.console import Console
+
+from drivers.errors import NotConnected
+from experiments.campaign import frame
+from experiments.campaign.engine import run_jobs
+from experiments.campaign.folder import CampaignFolder
+from experiments.campaign.grid import parse_grid, parse_seeds, sweep_jobs
+from experiments.exit_codes import ExitCode
+from experiments.run_folder import write_json
+
+
+def sweep(
+    experiment: str,
+    station: str | None,
+    sets: Sequence[str],
+    grid: Sequence[str],
+    seeds: str | None,
+    *,
+    workers: int,
+    scheduler: str | None,
+    retries: int,
+    out: Path | None,
+    json_file: Path | None,
+    console: Console,
+    said: Console,
+) -> ExitCode:
+    """Run the sweep, print its table on ``console`` and what happens on ``said``.
+
+    Raises InputError and InfeasiblePlan before anything is started. A sweep that is cut off leaves the table of what
+    has been run: KeyboardInterrupt, NotConnected.
+    """
+    jobs = sweep_jobs(experiment, station, sets, parse_grid(grid, sets), parse_seeds(seeds))
+    name = Path(experiment).stem
+    folder = out or Path("runs") / f"{name}-sweep-{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"
+    said.print(f"{len(jobs)} jobs in {folder}", highlight=False, soft_wrap=True)
+    try:
+        outcomes = run_jobs(jobs, folder, workers=workers, scheduler=scheduler, retries=retries, console=said)
+    except KeyboardInterrupt:
+        _conclude(folder, ExitCode.INTERRUPTED, json_file, console, said)
+        raise
+    except NotConnected:
+        _conclude(folder, ExitCode.DEVICE_FAILED, json_file, console, said)
+        raise
+    whole = all(outcome.status == "completed" for outcome in outcomes)
+    code = ExitCode.DONE if whole else ExitCode.FELL_SHORT
+    _conclude(folder, code, json_file, console, said)
+    return code
+
+
+_STATUS = {
+    ExitCode.DONE: "completed",
+    ExitCode.FELL_SHORT: "fell_short",
+    ExitCode.DEVICE_FAILED: "scheduler_failed",
+    ExitCode.INTERRUPTED: "interrupted",
+}
+
+
+def _conclude(folder: Path, code: ExitCode, json_file: Path | None, console: Console, said: Console) -> None:
+    """Write and show the table and the summary of what has been run."""
+    campaign = CampaignFolder(folder)
+    if not campaign.campaign.is_file():
+        return  # it was interrupted before anything was started
+    summary, trials = _summary(campaign, code)
+    frame.save(folder, summary, trials)
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        write_json(json_file, summary)
+    console.print(frame.summary_table(f"sweep of {summary['experiment']}", summary["cells"]))
+    for job in summary["failed"]:
+        said.print(f"{job['id']}: {job['reason']}", style="red", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"trials: {folder / frame.TRIALS}", soft_wrap=True, highlight=False)
+
+
+def _summary(campaign: CampaignFolder, code: ExitCode) -> tuple[dict[str, Any], DataFrame]:
+    told, trials = campaign.read(), frame.trials_frame(campaign.path)
+    folders = {job["id"]: campaign.job(job["id"]) for job in told["jobs"]}
+    failed = [
+        {"id": job["id"], "tags": job["tags"], "reason": failure}
+        for job in told["jobs"]
+        if (failure := folders[job["id"]].failure) is not None
+    ]
+    summary = {
+        "schema": 1,
+        "status": _STATUS[code],
+        "experiment": told["experiment"],
+        "jobs": len(told["jobs"]),
+        "ended": sum(folder.ended() is not None for folder in folders.values()),
+        "failed": failed,
+        "trials": len(trials),
+        "cells": frame.cells(campaign.path, trials),
+    }
+    return summary, trials

@@ -1,0 +1,100 @@
+"""What a worker does with a job. All that passes through the scheduler is the name of the job's folder.
+
+A worker imports and compiles at its first job and keeps it for the others.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+from contextlib import chdir
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from distributed import Worker, WorkerPlugin
+
+if TYPE_CHECKING:
+    from experiments.files import Resolved
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+#: jobs are run one at a time in a process, whatever number of threads its worker has: the current folder is shared
+_ALONE = threading.Lock()
+
+
+class JobFailed(Exception):
+    """The run did not come to its end: a device failed, or this worker cannot work. Another attempt may do better."""
+
+
+class Unattended(WorkerPlugin):
+    """A worker that leaves Ctrl-C to the process that started it, which closes its workers in order."""
+
+    name = "extrinsic-unattended"
+    idempotent = True
+
+    def setup(self, worker: Worker) -> None:
+        """Ignore SIGINT, where this is a process of its own."""
+        if threading.current_thread() is threading.main_thread() and worker.nanny is not None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def work(job: str, here: str) -> str:
+    """Run the job in the folder ``job`` into a new run folder, with ``here`` as the current folder; the run's name.
+
+    A job that has ended already is left as it is: a worker may die between its last file and its answer. Raises
+    JobFailed when a device failed, and whatever the run raises.
+    """
+    path = Path(job)
+    if not path.is_dir() or not Path(here).is_dir():
+        raise JobFailed(f"{socket.gethostname()} does not see {path}: let all workers share the sweep's file system")
+    with _ALONE, chdir(here):
+        _prepare()
+        return _run(path)
+
+
+@cache
+def _prepare() -> None:
+    """One thread for each library, here and in the simulated hosts, before any of them is imported."""
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    from experiments import kernels
+
+    kernels.keep()
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(limits=1)
+    torch.set_num_threads(1)
+
+
+def _run(path: Path) -> str:
+    from rich.console import Console
+
+    from experiments import runner
+    from experiments.campaign.folder import JobFolder
+    from experiments.exit_codes import ExitCode
+    from experiments.files import load
+
+    folder = JobFolder(path)
+    if (ended := folder.ended()) is not None:
+        return ended[0].name
+    run = folder.next_run()
+    with run.with_name(f"{run.name}.log").open("w", encoding="utf-8") as said:
+        outcome = runner.run(_on_its_own(load(str(folder.experiment))), run, Console(file=said, width=120))
+    if outcome.exit_code in (ExitCode.DEVICE_FAILED, ExitCode.INTERRUPTED):
+        raise JobFailed(outcome.reason)
+    return run.name
+
+
+def _on_its_own(resolved: Resolved) -> Resolved:
+    """A simulated station at an endpoint that nobody else uses; a laboratory's is where it is."""
+    from experiments.ports import free_endpoint
+
+    station = resolved.station
+    if station.world is None or any(device.backend != "sim" for device in station.devices.values()):
+        return resolved
+    bus = station.bus.model_copy(update={"endpoint": free_endpoint()})
+    return replace(resolved, station=station.model_copy(update={"bus": bus}))

@@ -1,0 +1,1 @@
+"""Tables of many trials from one file: which calibrations, which runs, and what is printed beside whose figures."""
