@@ -32,8 +32,8 @@ browser:
 	  fi; \
 	fi
 
-demo: setup  ## plan, execute and report grasped pivoting on the simulated station
-	@$(BIN)/extrinsic run experiments/grasped_pivoting.yaml
+demo: setup  ## calibrate, plan, tip a pentagon over its corner and report, in a simulated laboratory
+	@$(BIN)/extrinsic run experiments/demo.yaml --set world.profile=lab
 
 test: setup browser  ## the default test suite
 	@$(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder tests/experiments tests  # the long ones first

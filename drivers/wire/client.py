@@ -233,8 +233,9 @@ class RemoteTagCamera(RemoteSensor[TagReading], TagCamera):
 
     kind = "tag_camera"
 
-    def capture(self, timeout: float = 2.0) -> TagReading:
-        """As `ImagingSensor.capture`."""
+    def capture(self, timeout: float | None = None) -> TagReading:
+        """As `ImagingSensor.capture`; None: as long as the bus waits for any reply."""
+        timeout = self._link.bus.timeout if timeout is None else timeout
         self._command("capture", timeout=timeout)
         return self.latest(timeout)  # the frame is here: a reply comes after what was published before it
 
@@ -249,8 +250,12 @@ class RemoteTactile(RemoteSensor[ImageReading], TactileSensor):
 
     kind = "tactile"
 
-    def capture(self, timeout: float = 2.0) -> ImageReading:
-        """As `ImagingSensor.capture`. A frame that is lost on its way is made up for by the next one of the stream."""
+    def capture(self, timeout: float | None = None) -> ImageReading:
+        """As `ImagingSensor.capture`; None: as long as the bus waits for any reply.
+
+        A frame that is lost on its way is made up for by the next one of the stream.
+        """
+        timeout = self._link.bus.timeout if timeout is None else timeout
         deadline = time.monotonic() + timeout
         wanted = json.loads(self._command("capture", timeout=timeout).text)
         with self._holding("capture"):
