@@ -22,8 +22,8 @@ def error_table(results: dict[str, Any]) -> Table:
     title = f"{results['experiment']} on {results['station']}, seed {results['seed']}"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     table.add_column("trial", overflow="fold")
-    table.add_column("status")
-    table.add_column("seen by")
+    table.add_column("status", no_wrap=True)
+    table.add_column("seen by", no_wrap=True)
     moved = any(trial.get("extrinsic_object") for trial in results["trials"])
     figures = [key for key in COLUMNS if moved or key != "eo_pose_mm"]
     for key in figures:
@@ -55,14 +55,13 @@ def error_table(results: dict[str, Any]) -> Table:
 def _rows(
     table: Table, name: str, status: str, trials: list[dict[str, Any]], style: str | None, keys: Sequence[str]
 ) -> None:
-    """A row for each witness: one trial's figures, or mean and spread over the trials' means."""
+    """A line for each witness, beside the name: one trial's figures, or mean and spread over the trials' means."""
+    lines: list[list[str]] = []
     for witness in ("measured", "truth"):
         seen = [trial[witness] for trial in trials if trial[witness] is not None]
-        if not seen and witness == "truth":
-            continue
-        cells = [_cell(_over([figures.get(key) for figures in seen])) for key in keys]
-        table.add_row(name, status, witness, *cells, style=style)
-        name = status = ""
+        if seen or witness == "measured":
+            lines.append([witness, *(_cell(_over([figures.get(key) for figures in seen])) for key in keys)])
+    table.add_row(name, status, *("\n".join(column) for column in zip(*lines, strict=True)), style=style)
 
 
 def _over(figures: list[dict[str, float] | None]) -> dict[str, float] | None:
