@@ -75,7 +75,7 @@ CASES = {
     "misspelt key of a stage": (
         ("mine.yaml", "    plan: press", "    plan: press\n    trails: 2"),
         "mine.yaml, line 13: stages.1.trails: unknown key",
-        "one of controllers, first, plan, settings, stage, trials",
+        "one of controllers, first, plan, restiffen, settings, stage, trials",
         "trials",
     ),
     "misspelt parameter of a skill": (
