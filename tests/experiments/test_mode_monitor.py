@@ -34,7 +34,7 @@ def needed():
 def slippery(seed, needed):
     """How far the ground of this lab has to change for the pentagon to have 0.9 of the µ that its plan needs."""
     need, believed = needed
-    in_lab = Lab(load_profile("lab"), seed).friction({"pentagon-ground": believed})["pentagon-ground"]
+    in_lab = Lab(load_profile("lab"), seed).friction({"eo-ground": believed})["eo-ground"]
     return 0.9 * need / in_lab
 
 
