@@ -84,17 +84,20 @@ class Stroke:
 def drawn(
     rng: np.random.Generator, count: int, tilt: tuple[float, float], force: tuple[float, float], length: float
 ) -> list[Stroke]:
-    """Random strokes, every other one to the other side.
+    """Random strokes, each followed by its like to the other side.
 
+    What turns the forces, such as a sensor that sits askew, adds to the ratio on one side what it takes on the other.
     The object leans back, as far as friction turns the contact force or less: that runs then along an axis of the wrist
     sensor, where its gains turn it least. Leaning to where the motion goes they would turn it by half as much again as
     the gains differ.
     """
-    strokes = []
+    strokes: list[Stroke] = []
+    lean = pressed = 0.0
     for i in range(count):
         direction = 1.0 if i % 2 else -1.0
-        lean = direction * float(rng.uniform(*tilt))
-        strokes.append(Stroke(lean, float(rng.uniform(*force)), -0.5 * direction * length, 0.5 * direction * length))
+        if i % 2 == 0:
+            lean, pressed = float(rng.uniform(*tilt)), float(rng.uniform(*force))
+        strokes.append(Stroke(direction * lean, pressed, -0.5 * direction * length, 0.5 * direction * length))
     return strokes
 
 

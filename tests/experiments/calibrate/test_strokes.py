@@ -1,11 +1,12 @@
-"""Strokes that friction is found from: what cannot tell anything is refused before anything moves."""
+"""Strokes that friction is found from: how they are drawn, and that what tells nothing is refused before it moves."""
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from estimation.errors import FitError
-from experiments.calibrate.strokes import Stroke, stroked
+from experiments.calibrate.strokes import Stroke, drawn, stroked
 
 NOBODY: Any = None
 
@@ -15,3 +16,16 @@ def test_a_stroke_too_short_or_too_fast_to_move_evenly_is_refused(length: float,
     stroke = Stroke(tilt=0.3, force=4.0, begin=-length / 2, end=length / 2)
     with pytest.raises(FitError, match="even motion"):
         stroked(NOBODY, NOBODY, stroke, speed)
+
+
+def test_each_stroke_is_followed_by_its_like_to_the_other_side() -> None:
+    strokes = drawn(np.random.default_rng(0), 7, (0.1, 0.3), (3.0, 6.0), 0.02)
+    for there, back in zip(strokes[::2], strokes[1::2], strict=False):
+        assert (back.tilt, back.force, back.begin, back.end) == (-there.tilt, there.force, -there.begin, -there.end)
+    assert len({stroke.force for stroke in strokes}) == 4, "drawn anew for each pair"
+
+
+def test_the_object_leans_back_from_where_it_goes() -> None:
+    for stroke in drawn(np.random.default_rng(1), 6, (0.1, 0.3), (3.0, 6.0), 0.02):
+        forward = np.sign(stroke.end - stroke.begin)
+        assert 0.1 <= forward * stroke.tilt <= 0.3, "turned counter-clockwise where it goes to the right"
