@@ -20,6 +20,20 @@ from rich.progress import Progress as Bars
 STYLES = {"info": "", "warning": "yellow", "error": "red"}
 
 
+def counted(console: Console, speed_over: float = 30.0) -> Bars:
+    """Bars of things that are counted, with the time left by the speed over the last ``speed_over`` seconds."""
+    return Bars(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=console,
+        speed_estimate_period=speed_over,
+    )
+
+
 class Progress:
     """Shows what a run is doing on ``console``."""
 
@@ -45,15 +59,7 @@ class Progress:
             self.console.print(f"{escape(what)} ({total} waypoints) ...")
             yield lambda: None
             return
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
-        )
-        with Bars(*columns, console=self.console) as bars:
+        with counted(self.console) as bars:
             task = bars.add_task(escape(what), total=total)
             yield lambda: bars.advance(task)
 

@@ -99,6 +99,7 @@ class Host:
             now_ns=self._now_ns,
             shift_ns=lambda: self.skipped_ns,
             lockstep=self.world.lockstep,
+            lease=config.lease,
         )
         self._stopping = False
         self._staged = False

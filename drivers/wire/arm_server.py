@@ -12,7 +12,7 @@ import numpy as np
 from drivers.errors import CommandRefused, DriverError
 from drivers.interfaces import Arm, ArmTarget
 from drivers.wire import messages, topics
-from drivers.wire.lease import PATIENT_TIME_TO_LIVE, TIME_TO_LIVE, LeaseTable
+from drivers.wire.lease import LeaseTable
 from drivers.wire.server import Answer, Desk, DeviceServer
 
 _TICK = 0.05
@@ -29,7 +29,7 @@ class ArmServer(DeviceServer):
     def __init__(self, desk: Desk, arm: Arm):
         super().__init__(desk, arm)
         self.arm = arm
-        self._table = LeaseTable(PATIENT_TIME_TO_LIVE if desk.lockstep else TIME_TO_LIVE)
+        self._table = LeaseTable(desk.lease)
         self._lock = threading.Lock()
         self._served: str | None = None  # for whom the arm's own lease is held; only the owner's thread touches it
         self._sequence = -1

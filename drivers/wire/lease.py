@@ -9,10 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 TIME_TO_LIVE = 1.0
-"""How long a lease lasts without renewal [s]: the reach of a frozen commander."""
-
-PATIENT_TIME_TO_LIVE = 20.0
-"""The same in lockstep [s]: there a frozen commander moves nothing, so nobody but the next commander waits for it."""
+"""How long a lease lasts without renewal [s] where nobody says otherwise: the reach of a frozen commander."""
 
 RENEWAL = 0.25
 """How often a holder renews [s]: three renewals may be lost before the lease lapses."""

@@ -27,6 +27,7 @@ from drivers.interfaces import Device, ForceTorqueSensor, Gripper, ImagingSensor
 from drivers.wire import messages, topics
 from drivers.wire.bus import Bus, Query
 from drivers.wire.codec import Reading, encode_compressed, encode_reading
+from drivers.wire.lease import TIME_TO_LIVE
 from drivers.wire.streams import Publisher
 from mechanics.readings import ImageReading, Stamp
 
@@ -82,8 +83,8 @@ class Desk:
     """What the servers of one process share: the bus, the thread that owns the devices, the clock, the streams.
 
     ``run(work, urgent)`` has ``work`` executed by the owner of the devices. ``shift_ns()`` is added to every capture
-    time. In ``lockstep`` time stands still for who is slow: a slow reader holds up even images, and a slow commander
-    keeps its lease for longer.
+    time. In ``lockstep`` time stands still for who is slow, so a slow reader holds up even images. ``lease`` [s] is
+    how long a commander may be silent before it loses its arm.
     """
 
     def __init__(
@@ -95,10 +96,11 @@ class Desk:
         now_ns: Callable[[], int] = time.time_ns,
         shift_ns: Callable[[], int] = lambda: 0,
         lockstep: bool = False,
+        lease: float = TIME_TO_LIVE,
     ):
         self.bus, self.station, self.now_ns, self.shift_ns = bus, station, now_ns, shift_ns
         self.run: Run = run or Lane()
-        self.lockstep = lockstep
+        self.lockstep, self.lease = lockstep, lease
         self.publishers: list[Publisher] = []
         self._lossless: list[Publisher] = []
 

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.progress import Progress as Bars
+
+from experiments.progress import counted
 
 Tell = Callable[[str], None]
 
@@ -20,16 +20,8 @@ def progress(console: Console, total: int, done: int = 0) -> Iterator[Tell]:
     if done:
         console.print(f"{done} of {total} jobs are done already")
     if console.is_terminal:
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            # a job may take minutes: the speed is that of the whole campaign, not of the last half minute
-            TimeRemainingColumn(),
-        )
-        with Bars(*columns, console=console, speed_estimate_period=24 * 3600.0) as bars:
+        # a job may take minutes: the speed is that of the whole campaign, not of the last half minute
+        with counted(console, speed_over=24 * 3600.0) as bars:
             task = bars.add_task("jobs", total=total, completed=done)
 
             def advance(word: str) -> None:

@@ -12,6 +12,7 @@ from planning.receding import tracking
 from planning.skills.base import SKILLS, Extrinsic, Held, Scene
 from tests.control.corner_plant import cross, turn
 from tests.control.test_mpc import HELD
+from tests.planning.problems import MOVED
 
 from mechanics.catalogue import load_object  # isort: skip
 
@@ -34,13 +35,6 @@ CASES = [
     ("extrinsic_pushing", {}),
     ("extrinsic_pushing", {"distance_mm": -20.0}),
 ]
-SHAPES = {
-    "static_in_contact": "hbox",
-    "relative_pivoting": "hbox",
-    "relative_sliding": "hbox",
-    "extrinsic_pushing": "hbox",
-    "extrinsic_pivoting": "tall_box",
-}
 _made = {}
 
 
@@ -49,8 +43,8 @@ def made(skill, parameters=None, mu_ground=0.8, shape=None):
     key = skill, tuple((parameters or {}).items()), mu_ground, shape
     if key not in _made:
         scene = Scene(HELD)
-        if skill in SHAPES:
-            on_table = load_object(shape or SHAPES[skill])
+        if skill in MOVED:
+            on_table = load_object(shape or MOVED[skill])
             scene = Scene(HELD, Extrinsic(on_table.polygon.vertices, on_table.mass, 0.5, mu_ground))
         given = SKILLS[skill].Parameters.model_validate({"steps": 5, **(parameters or {})})
         task = SKILLS[skill].task(given, scene)

@@ -19,15 +19,9 @@ from planning.optimisers.lm import LevenbergMarquardt
 from planning.planner import plan
 from planning.problem import Form, Limits
 from planning.skills.base import SKILLS
+from tests.planning.problems import MOVED
 
 GRASPED = ("grasped_static", "grasped_pivoting", "grasped_sliding")
-SHAPES = {
-    "static_in_contact": "hbox",
-    "relative_pivoting": "hbox",
-    "relative_sliding": "hbox",
-    "extrinsic_pushing": "hbox",
-    "extrinsic_pivoting": "tall_box",
-}
 
 
 class Reversing(Optimiser):
@@ -43,7 +37,7 @@ class Reversing(Optimiser):
 def task_of(scene_of):
     def make(name, form=Form.CLOSED, limits=None, scene=None, **parameters):
         skill = SKILLS[name]
-        scene = scene_of(SHAPES.get(name)) if scene is None else scene
+        scene = scene_of(MOVED.get(name)) if scene is None else scene
         extra = {} if limits is None else {"limits": limits}
         return skill.task(skill.Parameters.model_validate(parameters), scene, form=form, **extra)
 

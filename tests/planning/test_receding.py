@@ -21,15 +21,7 @@ from planning.receding import (
     window,
 )
 from planning.skills.base import SKILLS
-from tests.planning.problems import pivoting_pentagon
-
-SHAPES = {
-    "static_in_contact": "hbox",
-    "relative_pivoting": "hbox",
-    "relative_sliding": "hbox",
-    "extrinsic_pushing": "hbox",
-    "extrinsic_pivoting": "tall_box",
-}
+from tests.planning.problems import MOVED, pivoting_pentagon
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +32,7 @@ def made(scene_of):
     def make(name, form=Form.CLOSED, **parameters):
         key = name, form, tuple(parameters.items())
         if key not in known:
-            skill, scene = SKILLS[name], scene_of(SHAPES.get(name), mu_ground=0.8)
+            skill, scene = SKILLS[name], scene_of(MOVED.get(name), mu_ground=0.8)
             task = skill.task(skill.Parameters.model_validate({"steps": 6, **parameters}), scene, form=form)
             known[key] = task, plan(task, "p", optimiser=LevenbergMarquardt(iterations=30))
         return known[key]
