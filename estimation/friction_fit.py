@@ -6,6 +6,8 @@ cone, blurred by the same noise; and a few outliers anywhere. The edge of the mi
 share that slips, which neither the largest ratio nor a quantile can say. The cone's apex is a nuisance with a prior: a
 zero that is off by 0.1 N is 10 % of the ratio at 1 N. Where forces come in strokes, each after a tare of its own, every
 stroke has an offset of its own too, which is integrated out: some readings of one stroke are no independent evidence.
+And there the axes may be turned a little: what that adds to the ratio on one side it takes on the other, whatever the
+forces of either.
 """
 
 from __future__ import annotations
@@ -30,8 +32,12 @@ FORCE_NOISE = 0.02
 ZERO_ERROR = 0.1
 #: how far it may be off from stroke to stroke, 1 sigma, and by which factor that itself is not known, 1 sigma
 STROKE_ERROR, STROKE_FACTOR = 0.02, 2.0
-#: offsets of a stroke that its likelihood is summed over, in sigmas
-_OFFSETS = np.linspace(-3.5, 3.5, 43)
+#: how far the forces' axes may be turned against the contact's, 1 sigma [rad]
+TURNED = 0.005
+#: offsets of a stroke that its likelihood is integrated over: in their sigmas, and about its peak, in the peak's
+_COARSE, _FINE = np.linspace(-3.5, 3.5, 29), np.linspace(-5.0, 5.0, 21)
+#: steps by which the peak is found from the best of the coarse offsets
+_PEAK_STEPS = 3
 #: calibration error of each force axis, relative, 1 sigma: it scales the ratio and no sample shows it
 GAIN_ERROR = 0.005
 #: samples that must slip, and by how much slip must raise the log likelihood
@@ -122,7 +128,7 @@ def fit_friction(
     if strokes is None:
         return plain.result(found, gain_error)
     by_stroke = _StrokeCone(values, fast, stroke, force_noise, zero_error)
-    return by_stroke.result(by_stroke.best([by_stroke.start(found)]), gain_error)
+    return by_stroke.result(by_stroke.best([by_stroke.start(plain, found)]), gain_error)
 
 
 def _fast(slip_speed: ArrayLike | None, noise: float, n: int) -> NDArray[np.bool_]:
@@ -164,13 +170,17 @@ class _Cone:
 
     def _densities(self, p: Array, offset: Array | float = 0.0) -> Array:
         """Densities (..., n, 3) [1/N] of |f_t| from the apex: slipping, sticking, neither; ``offset`` (..., n) [N]."""
-        mu, width = p[0], np.exp(p[3]) * self._noise * np.sqrt(1 + p[0] ** 2)
-        edge = mu * np.maximum(self._force[:, 0] - p[1], 0.25 * LEAST_NORMAL_FORCE)
+        width = np.exp(p[3]) * self._noise * np.sqrt(1 + p[0] ** 2)
+        edge = self._slope(p) * np.maximum(self._force[:, 0] - p[1], 0.25 * LEAST_NORMAL_FORCE)
         side = np.abs(self._force[:, 1] - p[2]) - offset
         beyond = (side - edge) / width
         atom = np.exp(-0.5 * beyond**2) / (width * np.sqrt(2 * np.pi))
         within = (ndtr(-beyond) - ndtr(-(side + edge) / width)) / edge
         return np.stack([atom, within, np.full_like(side, 1 / self._span)], axis=-1)
+
+    def _slope(self, p: Array) -> Array | float:
+        """That of the edge on the side of each sample."""
+        return p[0]
 
     def _shares(self, p: Array) -> Array:
         """Shares (n, 3) of the three, by the group of each sample."""
@@ -190,7 +200,7 @@ class _Cone:
 
     def _cost(self, z: Array) -> float:
         p = z * self._unit
-        if p[0] <= 1e-4 or np.abs(p[3 : self.ahead]).max() > 5:
+        if np.min(self._slope(p)) <= 1e-4 or np.abs(p[3 : self.ahead]).max() > 5:
             return 1e9
         # weak priors keep a share or a width that the samples do not show from running away
         prior = float(np.sum((p[1:3] / self._zero) ** 2) + p[3] ** 2 + np.sum((p[self.ahead :] / 3) ** 2))
@@ -279,37 +289,72 @@ class _Cone:
 
 
 class _StrokeCone(_Cone):
-    """The same, with an offset for every stroke that is integrated out; the fifth parameter is the log of its size."""
+    """The same, with an offset for every stroke that is integrated out, and axes that are turned.
 
-    ahead = _PARAMETERS + 1
+    The parameters before the shares end with the log of the offsets' size, and the angle [rad]. All strokes share the
+    apex. Each has a tare of its own, so what they share of the tares' errors is their mean.
+    """
+
+    ahead = _PARAMETERS + 2
 
     def __init__(
         self, force: Array, fast: NDArray[np.bool_], stroke: NDArray[np.intp], noise: float, zero_error: float
     ):
         order = np.argsort(stroke, kind="stable")
-        super().__init__(force[order], fast[order], noise, zero_error)
         self._stroke = stroke[order]
         self._begins = np.flatnonzero(np.diff(self._stroke, prepend=-1))
-        self._weights = norm.logpdf(_OFFSETS) - logsumexp(norm.logpdf(_OFFSETS))
+        super().__init__(force[order], fast[order], noise, zero_error / np.sqrt(len(self._begins)))
+        self._unit[_PARAMETERS + 1] = 0.3 * TURNED
+        self._side = np.sign(self._force[:, 1])
 
-    def start(self, plain: Array) -> Array:
-        """From where the fit without offsets ends."""
-        return np.insert(plain, _PARAMETERS, 0.0)
+    def start(self, plain: _Cone, found: Array) -> Array:
+        """From where the fit without offsets, ``plain``, ended."""
+        p = np.insert(found * plain._unit, _PARAMETERS, [0.0, 0.0])
+        return p / self._unit
 
-    def _by_offset(self, p: Array) -> Array:
-        """Log likelihood (offsets, strokes) of each stroke with each offset, that of the offset included."""
-        offsets = STROKE_ERROR * np.exp(p[_PARAMETERS]) * _OFFSETS
-        joint = np.einsum("osc,sc->os", self._densities(p, offsets[:, None]), self._shares(p))
-        return np.add.reduceat(np.log(np.maximum(joint, 1e-300)), self._begins, axis=1) + self._weights[:, None]
+    def _slope(self, p: Array) -> Array:
+        # the tangent of an angle that is turned changes by 1 + µ² of it
+        return p[0] + self._side * (1 + p[0] ** 2) * p[_PARAMETERS + 1]
+
+    def _by_offset(self, p: Array, offsets: Array) -> Array:
+        """Log density (o, strokes) [1/N] of each stroke and each of its ``offsets`` (o, strokes) [N]."""
+        size = STROKE_ERROR * np.exp(p[_PARAMETERS])
+        joint = np.einsum("osc,sc->os", self._densities(p, offsets[:, self._stroke]), self._shares(p))
+        samples = np.add.reduceat(np.log(np.maximum(joint, 1e-300)), self._begins, axis=1)
+        return samples + norm.logpdf(offsets / size) - np.log(size)
+
+    def _peaks(self, p: Array) -> tuple[Array, Array]:
+        """The likeliest offset (strokes,) of each stroke [N], and how wide its peak is, 1 sigma.
+
+        What slips lies on the edge, but for the offset and a sample's own noise: the peak is as narrow as that of their
+        mean, which is far narrower than the offsets themselves.
+        """
+        size = STROKE_ERROR * np.exp(p[_PARAMETERS])
+        coarse = np.repeat(size * _COARSE[:, None], len(self._begins), axis=1)
+        peak = np.take_along_axis(coarse, self._by_offset(p, coarse).argmax(axis=0)[None], axis=0)[0]
+        width = np.exp(p[3]) * self._noise * np.sqrt(1 + p[0] ** 2)
+        beyond = np.abs(self._force[:, 1] - p[2]) - self._slope(p) * np.maximum(self._force[:, 0] - p[1], 0.0)
+        precision = np.full(len(peak), size**-2)
+        for _ in range(_PEAK_STEPS):
+            joint = self._densities(p, peak[self._stroke]) * self._shares(p)
+            slips = joint[:, 0] / np.maximum(joint.sum(axis=1), 1e-300)
+            precision = size**-2 + np.add.reduceat(slips, self._begins) / width**2
+            peak = np.add.reduceat(slips * beyond, self._begins) / width**2 / precision
+        return peak, precision**-0.5
 
     def _log_likelihood(self, p: Array) -> float:
-        prior = -0.5 * (p[_PARAMETERS] / np.log(STROKE_FACTOR)) ** 2
-        marginal: Array = np.asarray(logsumexp(self._by_offset(p), axis=0), float)
-        return float(marginal.sum() + prior)
+        peak, width = self._peaks(p)
+        size = STROKE_ERROR * np.exp(p[_PARAMETERS])
+        coarse = np.repeat(size * _COARSE[:, None], len(peak), axis=1)
+        offsets = np.sort(np.concatenate([coarse, peak + width * _FINE[:, None]]), axis=0)
+        apart = np.diff(offsets, axis=0, prepend=offsets[:1], append=offsets[-1:])
+        weights = 0.5 * (apart[1:] + apart[:-1])  # trapezoids
+        marginal = np.asarray(logsumexp(self._by_offset(p, offsets), axis=0, b=weights), float)
+        prior = (p[_PARAMETERS] / np.log(STROKE_FACTOR)) ** 2 + (p[_PARAMETERS + 1] / TURNED) ** 2
+        return float(marginal.sum()) - 0.5 * prior
 
     def _joint(self, p: Array) -> Array:
-        likeliest = STROKE_ERROR * np.exp(p[_PARAMETERS]) * _OFFSETS[self._by_offset(p).argmax(axis=0)]
-        return self._densities(p, likeliest[self._stroke]) * self._shares(p)
+        return self._densities(p, self._peaks(p)[0][self._stroke]) * self._shares(p)
 
 
 def _hessian(cost, p: Array, steps: Array) -> Array:

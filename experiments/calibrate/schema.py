@@ -79,7 +79,7 @@ class FrictionStage(_Model):
     tilt_deg: Vector2 = Field(
         default=(8.0, 20.0), description="range by which the held object leans back from where it is dragged to"
     )
-    stroke_mm: float = Field(default=15.0, gt=0, le=200, description="length of a stroke")
+    stroke_mm: float = Field(default=25.0, gt=0, le=200, description="length of a stroke")
     speed: float = Field(default=0.02, gt=0, le=0.2, description="[m/s]")
 
     @model_validator(mode="after")

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import CommandRefused
 from drivers.interfaces import ForceTorqueSensor
@@ -28,6 +29,8 @@ TOUCHED = 0.5
 GETTING_UP = 0.2
 #: and what the object swings in the fingers after it has [s]
 SWINGING = 0.1
+#: it slips where the ratio of its forces has come to this share of the last
+SLIPS = 0.97
 #: a stroke that moves evenly for less than this shows too little [s]
 LEAST_EVEN = 0.1
 #: how often the normal force is corrected before a stroke, and the largest step of it [m]
@@ -134,7 +137,9 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Draggin
     normal = se2.rotate(dragged.X_W_face[2], np.array([0.0, 1.0]))
     up = np.array([*(CLEARANCE * normal), 0.0])
     mover, seen_by = rig.mover, witnesses(rig)
-    above = loading[0] + up
+    # turned as it will be pressed: the tool, which weighs more than what is sought and is known only as well as the
+    # sensor's gains are, then hangs as it does in the stroke, and the tare takes its weight out
+    above = np.append((loading[0] + up)[:2], pressed[0, 2])
     rig.lift_to(above[1] + 0.01)
     mover.travel(np.array([above[0], mover.pose[1], above[2]]))
     mover.travel(above)
@@ -162,8 +167,23 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Draggin
     )
     tangent = np.array([normal[1], -normal[0]])
     forces = np.stack([on_object @ normal, on_object @ tangent], axis=-1)
+    forces = forces[:, np.mean(forces[:, :, 0], axis=0) > TOUCHED]
     angles = np.array([witness.angle(mover.pose) for witness in seen_by]) - dragged.X_W_face[2]
-    return Dragging(forces[:, np.mean(forces[:, :, 0], axis=0) > TOUCHED], angles)
+    return Dragging(forces[:, steady(forces[0])], angles)
+
+
+def steady(forces: Array) -> NDArray[np.bool_]:
+    """Which bins (n,) of ``forces`` (n, 2) = (f_n, f_t) by the sensor under the table are not those of getting going.
+
+    Where the object stuck until well into the even motion, it catches up with the fingers at once when it slips: the
+    wrist pulls harder than friction holds while it does. It slips from where the ratio of the forces is as at last.
+    """
+    steady = np.ones(len(forces), bool)
+    if len(forces):
+        ratio = np.abs(forces[:, 1]) / forces[:, 0]
+        slips = int(np.argmax(ratio >= SLIPS * np.median(ratio[-max(1, len(ratio) // 3) :])))
+        steady[slips : slips + round(SWINGING / BIN) if slips else 0] = False
+    return steady
 
 
 def _dragged(rig: Rig, path: Array, seconds: float) -> tuple[int, int]:

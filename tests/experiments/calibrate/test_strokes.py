@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimation.errors import FitError
-from experiments.calibrate.strokes import Stroke, drawn, stroked
+from experiments.calibrate.strokes import BIN, SWINGING, Stroke, drawn, steady, stroked
 
 NOBODY: Any = None
 
@@ -29,3 +29,16 @@ def test_the_object_leans_back_from_where_it_goes() -> None:
     for stroke in drawn(np.random.default_rng(1), 6, (0.1, 0.3), (3.0, 6.0), 0.02):
         forward = np.sign(stroke.end - stroke.begin)
         assert 0.1 <= forward * stroke.tilt <= 0.3, "turned counter-clockwise where it goes to the right"
+
+
+def test_what_gets_going_in_the_middle_of_a_stroke_is_left_out_and_what_sticks_or_slides_is_kept() -> None:
+    sticks = np.linspace(0.05, 0.31, 8)
+    ratio = np.append(sticks, np.full(14, 0.33))
+    gone = round(SWINGING / BIN)
+    expected = [True] * 8 + [False] * gone + [True] * (14 - gone)
+    assert steady(np.column_stack([np.full(22, 4.0), -4.0 * ratio])).tolist() == expected
+
+
+@pytest.mark.parametrize("bins", [0, 1, 20])
+def test_of_a_stroke_that_slides_all_along_nothing_is_left_out(bins: int) -> None:
+    assert steady(np.tile([4.0, 1.3], (bins, 1))).tolist() == [True] * bins
