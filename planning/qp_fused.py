@@ -21,12 +21,14 @@ def kinds_of(
 ) -> tuple[NDArray[np.int8], NDArray[np.float64]]:
     """Return what each contact (K, C) is to the kernel, and µ or the slope f_t / f_n of the ray that it is confined to.
 
+    ``modes`` (K, C), ``mu`` (K, C) or (C,).
+
     A contact that sticks without friction has f_t = 0: a ray of slope 0.
     """
-    soft = np.broadcast_to(np.array(relaxed, dtype=bool), modes.shape)
-    ray = (np.abs(modes) == 1) | ((modes == STICK) & (mu == 0) & ~soft)
+    soft, slips = np.array(relaxed, dtype=bool), np.abs(modes) == 1
+    ray = slips | ((modes == STICK) & (mu == 0) & ~soft)
     kinds = np.where(ray, np.where(soft, RAY, PUSHING_RAY), np.where(soft, OPEN, CONE))
-    slope = np.where(np.abs(modes) == 1, modes * mu, mu)
+    slope = np.where(slips, modes * mu, mu)
     return np.where(modes == FREE, ABSENT, kinds).astype(np.int8), slope
 
 

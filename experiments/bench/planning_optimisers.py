@@ -18,6 +18,7 @@ from experiments.planning.make import objective
 from mechanics.readings import Array
 from planning.optimisers.base import Optimum
 from planning.optimisers.lm import Warm
+from planning.problem import Problem
 from planning.receding import shifted, window
 
 #: windows of a receding horizon, and those at its beginning that do not count
@@ -74,29 +75,44 @@ def _sampled(case: Case) -> Iterator[Figure]:
 
 
 def _replanned(case: Case) -> Iterator[Figure]:
-    """A horizon that slides one step at a time over a longer motion, the grasp estimated anew at each step."""
-    rng, known = np.random.default_rng(0), registries.optimisers()
+    """A horizon that slides one step at a time over a longer motion, the grasp estimated anew at each step.
+
+    Rounds of it take turns with single iterations of cvxpylayers: both are as fast as the machine is at that moment,
+    and their ratio is of one moment, too.
+    """
     long = pivoting_pentagon(case.steps + WINDOWS, case.problem.form)
+    slow, ratios, times, queries = case.objectives["cvxpylayers-fast"], [], [], []
+    for _ in range(max(case.runs, 5) if case.whole else 1):
+        begin = time.perf_counter()
+        slow.gradient(case.start)
+        iteration = time.perf_counter() - begin
+        taken, queries = _one_horizon(long, case.steps)
+        times.append(taken)
+        ratios.append(iteration / np.median(taken))
+    what = (
+        f"{WINDOWS} windows over {case.steps + WINDOWS} steps, each from the last plan moved on by a step, the grasp "
+        f"estimated anew, the objective's set-up counted; {np.median(queries):.0f} queries in the median"
+    )
+    yield case.figure("fused, lm warm", "plan", np.concatenate(times) * 1e3, "ms", what)
+    what = "taking turns with single iterations, each against the median of the re-plans that follow it"
+    yield case.figure("fused, lm warm", "re-plans per cvxpylayers iteration", ratios, "×", what)
+
+
+def _one_horizon(long: Problem, steps: int) -> tuple[Array, Array]:
+    """Times [s] and queries (n,) of the re-plans over a motion, those while it settles left out."""
+    rng, make = np.random.default_rng(0), objective("fused")
     # so near to the optimum Gauss–Newton's own curvature will do
-    lm, make = known["lm"](warm=Warm(), exact=False), objective("fused")
+    lm = registries.optimisers()["lm"](warm=Warm(), exact=False)
     z, times, queries = None, [], []
     for i in range(WINDOWS):
-        cut = regrasped(window(long, i, case.steps), rng)
+        cut = regrasped(window(long, i, steps), rng)
         begin = time.perf_counter()
         one = make(cut)
         found = lm.optimise(one, one.start if z is None else z, rng)
         times.append(time.perf_counter() - begin)
         queries.append(found.queries)
         z = shifted(found.z)
-    what = (
-        f"{WINDOWS} windows over {case.steps + WINDOWS} steps, each from the last plan moved on by a step, the grasp "
-        f"estimated anew, the objective's set-up counted; "
-        f"{np.median(queries[SETTLING:]):.0f} queries in the median"
-    )
-    plan = case.figure("fused, lm warm", "plan", np.array(times[SETTLING:]) * 1e3, "ms", what)
-    yield plan
-    slow = case.known["cvxpylayers fastest, Grad 100", "iteration"]
-    yield case.figure("fused, lm warm", "re-plans per cvxpylayers iteration", slow / plan.median, "×")
+    return np.array(times[SETTLING:]), np.array(queries[SETTLING:])
 
 
 def _against_adam(case: Case) -> Iterator[Figure]:

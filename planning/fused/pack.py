@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from math import cos, sin
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mechanics.friction import Mode, tangent
+from mechanics.friction import Mode
 from mechanics.readings import Array
 from planning.fused import layout
 from planning.problem import Form, Problem, Touch
@@ -32,7 +33,10 @@ class Packed(NamedTuple):
 
 
 def pack(problem: Problem) -> Packed:
-    """Return a problem's arrays. Raises ValueError where it has more contacts than a kernel takes."""
+    """Return a problem's arrays. Raises ValueError where it has more contacts than a kernel takes.
+
+    A re-plan begins with it, and it takes a good part of its time: few array operations, and no checks twice.
+    """
     n, m = len(problem.contacts), len(problem.ground)
     if n > 2 or m > 2:
         raise ValueError(
@@ -42,9 +46,8 @@ def pack(problem: Problem) -> Packed:
     two = problem.eo_body is not None
     relaxed = (two,) * n + (False,) * m
     contacts = (*problem.contacts, *problem.ground)
-    mu = np.tile([contact.mu for contact in contacts], (problem.steps, 1))
-    modes = np.array([[_CODES[mode] for mode in contact.modes] for contact in contacts], np.int8)
-    kinds, slope = kinds_of(modes.T, mu, relaxed)
+    modes = np.array([[_CODES[mode] for mode in contact.modes] for contact in contacts], np.int8).T
+    kinds, slope = kinds_of(modes, np.array([contact.mu for contact in contacts]), relaxed)
     return Packed(
         np.ascontiguousarray(kinds),
         _steps(problem, slope),
@@ -69,7 +72,7 @@ def _steps(problem: Problem, slope: NDArray[np.float64]) -> NDArray[np.float64]:
     eo = np.asarray(problem.eo)
     co, si = np.cos(eo[:, 2]), np.sin(eo[:, 2])
 
-    def put(at: int, vector: Array) -> None:
+    def put(at: int, vector: Array | tuple[float, float]) -> None:
         """Enter a vector of the eo's frame, in W. The checks of `mechanics.se2` take longer than all the rest here."""
         x, y = vector
         steps[:, at], steps[:, at + 1] = co * x - si * y, si * x + co * y
@@ -86,7 +89,7 @@ def _steps(problem: Problem, slope: NDArray[np.float64]) -> NDArray[np.float64]:
         put(at, contact.p_eo)
         steps[:, at : at + 2] += eo[:, :2]
         if eo_owns_face:
-            put(at + 2, tangent(contact.normal))
+            put(at + 2, _tangent(contact.normal))
             put(at + 4, into)
         else:
             steps[:, at + 4 : at + 6] = into
@@ -99,39 +102,42 @@ def _steps(problem: Problem, slope: NDArray[np.float64]) -> NDArray[np.float64]:
 def _fixed(problem: Problem) -> NDArray[np.float64]:
     fixed, K = np.zeros(layout.FIXED), problem.steps
 
-    def put(at: int, values: object) -> None:
-        flat = np.asarray(values, dtype=np.float64).ravel()
-        fixed[at : at + len(flat)] = flat
+    def put(at: int, *values: float) -> None:
+        fixed[at : at + len(values)] = values
 
-    rho = problem.go_body.rho
-    put(layout.SCALE, problem.scale)
-    put(layout.GO_WEIGHT, problem.go_body.mass * problem.gravity)
-    put(layout.EO_WEIGHT, problem.eo_body.mass * problem.gravity if problem.eo_body else 0.0)
-    put(layout.RHO, rho)
-    put(layout.LENGTH, LENGTH)
-    put(layout.U_OBJECT, problem.force_weight)
-    put(layout.GRASP, problem.grasp)
-    put(layout.GRASP_TURN, [np.cos(problem.grasp[2]), np.sin(problem.grasp[2])])
-    put(layout.STIFFNESS, problem.stiffness)
-    put(layout.COMPLIANCE, np.linalg.inv(problem.stiffness))
+    rho, grasp = problem.go_body.rho, problem.grasp.tolist()
+    put(layout.SCALE, *problem.scale)
+    fixed[layout.GO_WEIGHT] = problem.go_body.mass * problem.gravity
+    fixed[layout.EO_WEIGHT] = problem.eo_body.mass * problem.gravity if problem.eo_body else 0.0
+    fixed[layout.RHO], fixed[layout.LENGTH], fixed[layout.U_OBJECT] = rho, LENGTH, problem.force_weight
+    put(layout.GRASP, *grasp)
+    put(layout.GRASP_TURN, cos(grasp[2]), sin(grasp[2]))
+    put(layout.STIFFNESS, *problem.stiffness.ravel())
+    put(layout.COMPLIANCE, *np.linalg.inv(problem.stiffness).ravel().tolist())
     for c, contact in enumerate(problem.contacts):
-        put(layout.P_GO + 2 * c, contact.p_go)
-    put(layout.FACE_GO, tangent(problem.contacts[0].normal))
-    put(layout.SLACK, problem.slack_weight * np.array([1.0, 1.0, rho**-2]))
+        put(layout.P_GO + 2 * c, *contact.p_go)
+    put(layout.FACE_GO, *_tangent(problem.contacts[0].normal))
+    weight = problem.slack_weight
+    put(layout.SLACK, weight, weight, weight * rho**-2)
     names = ("cone", "pull", "smooth", "force", "penetration", "slack", "track", "workspace", "joints", "sensor")
-    put(layout.W_CONE, [(getattr(problem.weights, n) / (max(K - 1, 1) if n == "smooth" else K)) ** 0.5 for n in names])
+    weights = [getattr(problem.weights, name) / (max(K - 1, 1) if name == "smooth" else K) for name in names]
+    put(layout.W_CONE, *(weight**0.5 for weight in weights))
     limits = problem.limits
     if limits.workspace is not None:
-        put(layout.WORK_MIDDLE, limits.workspace.mean(axis=1))
-        put(layout.WORK_HALF, np.diff(limits.workspace, axis=1) / 2)
+        put(layout.WORK_MIDDLE, *limits.workspace.mean(axis=1))
+        put(layout.WORK_HALF, *(np.diff(limits.workspace, axis=1) / 2).ravel())
     if limits.arm is not None:
         arm = limits.arm
-        put(layout.BASE, [*arm.base, arm.upper, arm.fore, *arm.tool, arm.elbow, *arm.zero])
-        put(layout.JOINT_MIDDLE, arm.limits.mean(axis=1))
-        put(layout.JOINT_HALF, np.diff(arm.limits, axis=1) / 2)
-    put(layout.MOST_FORCE, limits.force or 0.0)
-    put(layout.MOST_TORQUE, limits.torque or 0.0)
+        put(layout.BASE, *arm.base, arm.upper, arm.fore, *arm.tool, arm.elbow, *arm.zero)
+        put(layout.JOINT_MIDDLE, *arm.limits.mean(axis=1))
+        put(layout.JOINT_HALF, *(np.diff(arm.limits, axis=1) / 2).ravel())
+    fixed[layout.MOST_FORCE], fixed[layout.MOST_TORQUE] = limits.force or 0.0, limits.torque or 0.0
     return fixed
+
+
+def _tangent(normal: Array) -> tuple[float, float]:
+    """`mechanics.friction.tangent` of one normal that the problem has checked."""
+    return float(normal[1]), -float(normal[0])
 
 
 def _flags(problem: Problem) -> NDArray[np.int64]:
