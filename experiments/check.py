@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from math import inf
+from typing import get_args
 
 from control.approach import resting_eo as resting
-from drivers.config import ForceTorqueConfig, WorldConfig
+from drivers.config import ForceTorqueConfig, TactileConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
 from experiments.calibrate.schema import CameraStage, FrictionStage
 from experiments.calibrate.store import Calibrations, load
 from experiments.files import Resolved
 from experiments.planning.files import plan_files
-from experiments.planning.make import resting_eo, task
+from experiments.planning.make import resting_eo, task, try_start
 from experiments.planning.schema import PlanStage
 from experiments.schema import ExecuteStage
 from experiments.setup import Believed, believed, go_pose, has_fingers, scene
-from mechanics.yaml_input import InputError, Problem
+from mechanics.yaml_input import InputError, Problem, one_of
 from planning.errors import InfeasiblePlan
 from planning.plan import Plan
 from planning.skills.base import SkillTask
+
+#: the sensors that fingers can be
+FINGERS = get_args(TactileConfig.model_fields["sensor"].annotation)
 
 
 def check(resolved: Resolved, calibrations: Calibrations | None = None, feasible: bool = True) -> list[str]:
@@ -107,12 +111,27 @@ def tasks(resolved: Resolved, known: Believed, feasible: bool = True) -> dict[st
             if feasible:
                 planner.check(asked)
             made[stage.name] = asked
+            _check_start(resolved, i, stage, asked)
         except ValueError as e:
             raise InputError([_task_problem(resolved, i, stage, str(e))]) from None
         except InfeasiblePlan:
             if feasible:
                 raise
     return made
+
+
+def _check_start(resolved: Resolved, i: int, stage: PlanStage, asked: SkillTask) -> None:
+    """Raise InputError where the optimiser has no start; NoStart where the nominal trajectory is none either."""
+    from experiments.planning.start import NoStart
+    from planning import evaluation
+
+    try:
+        try_start(resolved, stage, asked)
+    except NoStart as error:
+        if evaluation.refusal(asked.problem, asked.problem.start) is not None:
+            raise
+        key, expected = ("stages", i, "start", "sigma"), "an error, in mm and N, that leaves the motion possible"
+        raise InputError([resolved.experiment_document.problem(key, str(error), expected)]) from None
 
 
 def _resting_of_plan(plan: Plan) -> tuple[float, float, float] | None:
@@ -132,7 +151,7 @@ def _task_problem(resolved: Resolved, i: int, stage: PlanStage, text: str) -> Pr
 
 
 def _device_problems(resolved: Resolved) -> list[Problem]:
-    """A run commands an arm, and sees through a wrist force/torque sensor and a camera."""
+    """A run commands an arm, sees through a wrist force/torque sensor and a camera, and its sensor is its fingers'."""
     station, document = resolved.station, resolved.station_document
     problems = [
         document.problem(("devices",), f"the station has no {kind}", "a device of that kind")
@@ -146,6 +165,12 @@ def _device_problems(resolved: Resolved) -> list[Problem]:
         if isinstance(stage, FrictionStage | CameraStage) and not under:
             wrong = "the station has no force_torque under the table, which feels what touches it"
             problems.append(resolved.experiment_document.problem(("stages", i), wrong, "a device with mount: table"))
+    fingers = {name: device.sensor for name, device in station.devices.items() if isinstance(device, TactileConfig)}
+    named = resolved.sensor.name  # a sensor of one's own may have any name but another finger's
+    if named in FINGERS and (others := [f"{name} is a {kind}" for name, kind in fingers.items() if kind != named]):
+        wrong = f"{named} is not what the station {station.name} holds with: {', '.join(others)}"
+        expected = f"{one_of(set(fingers.values()))}, or a station with {named} fingers"
+        problems.append(resolved.experiment_document.problem(("sensor",), wrong, expected))
     if not station.table_tags:
         problems.append(document.problem(("table_tags",), "the table has no tags", "at least one tag"))
     if resolved.grasped.tag is None:

@@ -139,6 +139,7 @@ def _row(
     grasped, extrinsic = context.resolved.grasped, context.resolved.extrinsic if result.plan.eo is not None else None
     rho_go = grasped.polygon.radius_of_gyration
     rho_eo = None if extrinsic is None else extrinsic.polygon.radius_of_gyration
+    found = result.deviation
     return {
         "name": name,
         "skill": result.plan.skill,
@@ -151,6 +152,7 @@ def _row(
         "trial": trial,
         "status": result.status,
         "reason": result.reason,
+        "deviation": found and {"step": found.step, "status": found.status, "reason": found.reason},
         **{witness: errors_of(waypoints, witness, rho_go, rho_eo, rho_go) for witness in ("measured", "truth")},
         "contact": contact_of(waypoints, result.plan, grasped.polygon),
         "witness": witness_of(result.witness),

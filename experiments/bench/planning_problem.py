@@ -10,6 +10,7 @@ import numpy as np
 from experiments import setup
 from experiments.calibrate.store import Calibrations
 from experiments.files import Resolved, load
+from experiments.planning import start
 from experiments.planning.make import planning_scene
 from experiments.planning.schema import PlanStage
 from mechanics.readings import Array
@@ -44,12 +45,8 @@ def pivoting_pentagon(steps: int, form: Form) -> Problem:
 
 
 def disturbed(problem: Problem, objective: Objective, rng: np.random.Generator, away: float = AWAY) -> Array:
-    """z (K, 5) off the nominal trajectory by ``away`` (1σ) in every free variable, where the loss is finite."""
-    for _ in range(1000):
-        z = problem.start + away * np.where(problem.free, rng.standard_normal(problem.free.shape), 0.0)
-        if np.isfinite(objective.values(z[None])[0]):
-            return z
-    raise ValueError("bench: expected a finite loss somewhere near the nominal trajectory")
+    """z (K, 5) off the nominal trajectory by white noise of ``away`` (1σ), as `experiments.planning.start` draws it."""
+    return start.disturbed(problem, objective, rng, away)
 
 
 def regrasped(problem: Problem, rng: np.random.Generator) -> Problem:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 from zlib import crc32
 
@@ -69,23 +70,41 @@ def objective(backend: str) -> Callable[[Problem], Any]:
     return lambda problem: TorchObjective(problem, backend)
 
 
+def generator(resolved: Resolved, stage: PlanStage) -> np.random.Generator:
+    """A plan's random numbers: first its start, then the optimiser's. They follow seed and name, nothing else."""
+    return np.random.default_rng([resolved.experiment.seed, crc32(stage.name.encode())])
+
+
+def try_start(resolved: Resolved, stage: PlanStage, made_of: SkillTask) -> None:
+    """Draw the start that `make` will draw. Raises `experiments.planning.start.NoStart`."""
+    from experiments.planning.start import disturbed
+
+    if stage.start.sigma:
+        loss = objective("fused")(made_of.problem)
+        disturbed(made_of.problem, loss, generator(resolved, stage), stage.start.sigma, stage.start.beta)
+
+
 def make(resolved: Resolved, stage: PlanStage, known: Believed, made_of: SkillTask | None = None) -> Plan:
     """The plan of a stage, ``made_of`` its `task`; the same seed gives the same plan.
 
     Raises InfeasiblePlan and ValueError.
     """
+    from experiments.planning.start import Astray
     from planning.planner import plan
 
-    rng = np.random.default_rng([resolved.experiment.seed, crc32(stage.name.encode())])
-    asked = stage.model_dump(mode="json", include={"parameters", "backend", "limits"})
-    return plan(
-        task(resolved, stage, known) if made_of is None else made_of,
+    asked = task(resolved, stage, known) if made_of is None else made_of
+    optimiser, sigma = stage.make_optimiser(), stage.start.sigma
+    told = stage.model_dump(mode="json", include={"parameters", "backend", "limits", "start"})
+    made = plan(
+        asked,
         stage.name,
-        optimiser=stage.make_optimiser(),
+        optimiser=Astray(optimiser, asked.problem, sigma, stage.start.beta) if sigma else optimiser,
         objective=objective(stage.backend),
-        rng=rng,
-        provenance={"experiment": resolved.experiment.name, "seed": resolved.experiment.seed, **asked, **provenance()},
+        rng=generator(resolved, stage),
+        provenance={"experiment": resolved.experiment.name, "seed": resolved.experiment.seed, **told, **provenance()},
     )
+    # the optimiser's own settings, whatever it is wrapped in
+    return replace(made, provenance={**made.provenance, "optimiser": stage.optimiser})
 
 
 def resting_eo(asked: SkillTask) -> tuple[float, float, float] | None:

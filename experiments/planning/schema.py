@@ -1,4 +1,4 @@
-"""The plan stage of an experiment file: skill, optimiser, backend, form, weights of the losses, limits."""
+"""The plan stage of an experiment file: skill, optimiser, its start, backend, form, weights of the losses, limits."""
 
 from __future__ import annotations
 
@@ -97,6 +97,21 @@ class LimitsConfig(_Model):
         )
 
 
+class StartConfig(_Model):
+    """Where the optimiser sets out: the skill's nominal trajectory, every free variable off it by Gaussian noise.
+
+    The noise is drawn from the seed and the plan's name: the same for every optimiser.
+    """
+
+    sigma: float = Field(default=0.0, ge=0, le=100, description="1σ, about mm and N; 0: the nominal trajectory itself")
+    beta: float = Field(
+        default=3.0,
+        ge=0,
+        le=10,
+        description="its power falls as frequency^-beta along the steps, as a sampler's; 0: white",
+    )
+
+
 def _rising(range_: Range, *at: str | int) -> None:
     if not range_[0] < range_[1]:
         raise Refusal(f"{list(range_)} is no range", "[least, largest], the second above the first", at=at)
@@ -106,7 +121,8 @@ class PlanStage(_Model):
     """Make a plan with a skill. ``parameters`` are the skill's own, checked by its model, every default filled in.
 
     ``optimiser`` is a name, or ``name`` with that optimiser's settings; ``backend`` solves the contact programs;
-    ``form`` is what the variables are (`planning.problem`); ``weights`` are those of the losses.
+    ``form`` is what the variables are (`planning.problem`); ``weights`` are those of the losses; ``start`` is where the
+    optimiser sets out.
     """
 
     stage: Literal["plan"]
@@ -118,6 +134,7 @@ class PlanStage(_Model):
     form: Literal["closed", "paper"] = "closed"
     weights: WeightsConfig = WeightsConfig()  # type: ignore[valid-type]
     limits: LimitsConfig = LimitsConfig()
+    start: StartConfig = StartConfig()
 
     @classmethod
     def submodel(cls, key: str, data: dict[str, Any]) -> type[BaseModel] | None:

@@ -184,23 +184,39 @@ def _compared(entry: Comparison, data: Data) -> Iterator[Finding]:
     for each in combinations(frame, entry.each):
         name = ", ".join([entry.name, *map(str, filter(None, each.values()))])
         here = picked(frame, each)
-        sides = [_by_pair(picked(here, where), column) for where in (entry.a, entry.b)]
+        rows = [picked(here, where) for where in (entry.a, entry.b)]
+        sides = [_by_pair(side, column) for side in rows]
         common = [pair for pair in sides[0] if pair in sides[1]]
         if not common:
             yield Finding(name, None, "no pair of trials has both")
             continue
         found = statistics.paired([sides[0][pair] for pair in common], [sides[1][pair] for pair in common])
         value = {"mean": found.mean, "upper": found.high, "lower": found.low}[entry.judged]
-        interval = "no interval" if found.low is None else f"95 % {found.low:+.3f} to {found.high:+.3f}"
-        yield Finding(name, value, f"{found.mean:+.3f} ({interval}), {found.n} pairs")
+        asked = {pair for side in rows for pair in _pairs(side)}
+        early = {pair for side in rows for pair in _pairs(side.loc[side["status"] != "completed"])}.intersection(common)
+        told = f"{found.mean:+.3f} ({_told_apart(found)}), {found.n} of {len(asked)} pairs"
+        yield Finding(name, value, told + (f", {len(early)} not completed" if early else ""))
+
+
+def _told_apart(found: statistics.Estimate) -> str:
+    """Both ends of an interval, and what they say of the sign."""
+    if found.low is None or found.high is None:
+        return "no interval"
+    verdict = "surely below" if found.high < 0 else "surely above" if found.low > 0 else "undecided"
+    return f"95 % {found.low:+.3f} to {found.high:+.3f}, {verdict}"
+
+
+def _pairs(trials: pd.DataFrame) -> list[tuple[Any, ...]]:
+    """What pairs of trials are alike in, of each."""
+    return list(map(tuple, trials.loc[:, list(_PAIR)].to_numpy().tolist()))
 
 
 def _by_pair(trials: pd.DataFrame, column: str) -> dict[tuple[Any, ...], float]:
     """A figure by what pairs of trials are alike in."""
     if column not in trials:
         return {}
-    rows = trials.loc[:, [*_PAIR, column]].dropna().to_numpy().tolist()
-    return {tuple(pair): float(value) for *pair, value in rows}
+    known = trials.dropna(subset=[column])
+    return dict(zip(_pairs(known), known[column].to_numpy(float).tolist(), strict=True))
 
 
 def _counted(entry: Count, data: Data, shown: Sequence[Mapping[str, Any]]) -> Finding:

@@ -345,6 +345,32 @@ def test_a_scene_that_the_plant_would_refuse_is_refused_before_the_start(folder,
     assert says in text
 
 
+FINGERS = "  finger: {kind: tactile, sensor: gelslim, finger: left}\n"
+
+
+def test_a_sensor_that_the_stations_fingers_are_not_is_refused(folder):
+    (folder / "lab.yaml").write_text(STATION.replace("table_tags", FINGERS + "table_tags"))
+    assert refusal("lab.yaml") == (
+        "mine.yaml, line 3: sensor: soft_bubble is not what the station lab holds with: finger is a gelslim\n"
+        "    expected: gelslim, or a station with soft_bubble fingers"
+    )
+    assert check(load("mine.yaml", "lab.yaml", ["sensor=gelslim"]))
+    (folder / "gel.yaml").write_text(
+        "name: gel\nrho_mm: 1000\nstiffness_printed: [[5e3, 0, 0], [0, 9e3, 0], [0, 0, 30]]\n"
+    )
+    assert check(load("mine.yaml", "lab.yaml", ["sensor=gel.yaml"]))  # one's own figures of these fingers
+    (folder / "lab.yaml").write_text(STATION)  # without fingers nobody knows better
+    assert check(load("mine.yaml", "lab.yaml", ["sensor=gelslim"]))
+
+
+def test_an_object_cannot_be_held_and_touched_at_once_since_its_tag_would_stand_twice(folder):
+    edited(folder / "mine.yaml", "grasped_object: tall_box", "grasped_object: tall_box\nextrinsic_object: tall_box")
+    assert refusal() == (
+        "mine.yaml, line 5: extrinsic_object: its tag has the id 10, as has grasped_object\n"
+        "    expected: an id of its own for each tag"
+    )
+
+
 def test_bad_input_in_a_world_profile_of_ones_own(folder):
     (folder / "mine_profile.yaml").write_text("description: mine\narm: {repeatabilty: {angle_deg: 0.1}}\n")
     with pytest.raises(InputError) as e:

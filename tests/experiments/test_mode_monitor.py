@@ -71,6 +71,7 @@ def test_a_ground_ten_per_cent_under_the_need_ends_the_pivot_as_slipped(command,
     assert (told["status"], told["reason"]) == (end.status, end.reason)
     slip = true_slip(plan, waypoints)
     last = len(slip) - 1
+    assert told["deviation"] == {"step": last, "status": end.status, "reason": end.reason}
     assert end.status == "slipped" and end.reason.startswith(f"waypoint {last}: contact 'ground right' has slipped")
     assert slip[last] > 0.5 * MILLIMETRE  # it has slipped indeed
     beyond = np.flatnonzero(slip >= MILLIMETRE)

@@ -32,6 +32,7 @@ def test_what_is_not_said_is_second_order_fused_and_in_closed_form():
     assert (plain.backend, plain.form) == ("fused", "closed")
     assert plain.planner_form() is Form.CLOSED
     assert plain.loss_weights() == LossWeights()
+    assert plain.start.sigma == 0
 
 
 @pytest.mark.parametrize("name", ["gradient", "lm", "mppi", "icem"])
@@ -96,6 +97,9 @@ CASES = {
     "misspelt weight": ("weights: {cne: 1}", "weights.cne", "unknown key", "cone"),
     "workspace inside out": ("limits: {workspace: {x: [1, 0]}}", "limits.workspace.x", "is no range", ""),
     "force limit of nothing": ("limits: {force: 0}", "limits.force", "the number 0", ""),
+    "negative start": ("start: {sigma: -0.5}", "start.sigma", "the number -0.5", ""),
+    "misspelt key of the start": ("start: {sigam: 0.5}", "start.sigam", "unknown key", "sigma"),
+    "start that is no mapping": ("start: 0.5", "start", "the number 0.5", ""),
     "half an arm": ("limits: {arm: {upper: 1}}", None, "missing key", ""),
 }
 

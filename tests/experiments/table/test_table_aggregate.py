@@ -110,9 +110,33 @@ def test_a_comparison_is_over_pairs_alike_in_trajectory_and_trial():
     (found,) = aggregate._compared(entry, data(trials(), ours, alone))
     half = T_2 * 0.05 / np.sqrt(3)
     assert found.value == pytest.approx(-0.1 + half, abs=1e-3 * half)
-    assert "-0.100" in found.told and "3 pairs" in found.told
+    assert "-0.100" in found.told and found.told.endswith("3 of 4 pairs")
     (mean,) = aggregate._compared(entry.model_copy(update={"judged": "mean"}), data(trials(), ours))
     assert mean.value == pytest.approx(-0.1)
+
+
+@pytest.mark.parametrize(
+    ("shift", "verdict"),
+    [  # half the interval of differences that are 0.05 apart is 4.303 × 0.05/√3 = 0.124
+        ([-0.20, -0.15, -0.10], "95 % -0.274 to -0.026, surely below"),
+        ([-0.10, -0.05, 0.0], "95 % -0.174 to +0.074, undecided"),
+        ([0.10, 0.15, 0.20], "95 % +0.026 to +0.274, surely above"),
+    ],
+)
+def test_a_comparison_prints_both_ends_and_what_they_say(shift, verdict):
+    ours = trials("mpc", WAYPOINTS + np.array(shift)[:, None])
+    entry = Comparison(name="d", figure="wrench_N", a={"controller": "mpc"}, b={"controller": "open_loop"})
+    (found,) = aggregate._compared(entry, data(trials(), ours))
+    assert verdict in found.told
+    assert found.value is not None and (found.value <= 0) == verdict.endswith("below")
+
+
+def test_a_comparison_says_how_many_of_its_pairs_ended_early():
+    ours = trials("mpc")
+    ours[1]["status"] = "slipped"
+    entry = Comparison(name="d", figure="wrench_N", a={"controller": "mpc"}, b={"controller": "open_loop"})
+    (found,) = aggregate._compared(entry, data(trials(), ours))
+    assert found.told.endswith("3 of 3 pairs, 1 not completed")
 
 
 def test_a_comparison_without_pairs_says_so():
