@@ -27,10 +27,9 @@ def shares(sensitivities: ArrayLike, gain_error: float, noise: float) -> tuple[A
     """How much to believe each of several sensors (n,), summing to 1, and the relative error that is left, 1 sigma.
 
     ``sensitivities`` are those of the coefficient to each one's gains, ``gain_error`` is 1 sigma of an axis, relative.
-    ``noise`` is what each leaves besides, relative, 1 sigma: it only keeps a sensor from being believed alone, and
-    is no part of the error returned.
+    ``noise`` is what each leaves besides, relative, 1 sigma.
     """
-    own = 2 * (np.asarray(sensitivities, float) * gain_error) ** 2
-    share = 1 / (own + noise**2)
+    own = 2 * (np.asarray(sensitivities, float) * gain_error) ** 2 + noise**2
+    share = 1 / own
     share = share / share.sum()
     return share, float(np.sqrt(share**2 @ own))

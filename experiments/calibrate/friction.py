@@ -71,9 +71,10 @@ def friction_stage(context: RunContext, stage: FrictionStage) -> None:
 
 
 def _joined(found: list[Dragging]) -> tuple[Array, NDArray[np.intp], float]:
-    """Forces (n, 2) = (f_n, f_t) of all witnesses as one, the stroke (n,) of each, and what is left of their gains.
+    """Forces (n, 2) = (f_n, f_t) of all witnesses as one, the stroke (n,) of each, and what no sample shows.
 
-    Each is believed by how little its gains can turn the forces as it lies; the last is 1 sigma of an axis, relative.
+    Each is believed by how little its gains can turn the forces as it lies. The last is relative: 1 sigma of an axis's
+    gain that would leave as much of the coefficient as the witnesses' gains, and all that they leave besides, do.
     """
     ratios = [np.median(one.forces[:, :, 1] / one.forces[:, :, 0]) for one in found if one.forces.shape[1]]
     angles = np.array([one.angles for one in found if one.forces.shape[1]])

@@ -57,7 +57,7 @@ def test_what_is_left_is_the_least_that_any_shares_leave() -> None:
     assert share[0] == pytest.approx(tried[each.argmin()], abs=1e-3)
 
 
-def test_one_sensor_alone_is_believed_whatever_it_is() -> None:
+def test_one_sensor_alone_is_believed_whatever_it_is_and_leaves_both_of_its_errors() -> None:
     share, left = shares([1.4], gain_error=0.005, noise=0.003)
     np.testing.assert_allclose(share, [1.0])
-    assert left == pytest.approx(1.4 * 0.005 * np.sqrt(2))
+    assert left == pytest.approx(np.hypot(1.4 * 0.005 * np.sqrt(2), 0.003))
