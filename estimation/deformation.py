@@ -336,12 +336,12 @@ def _plane(depth: Image, touched: Mask, across: Image, down: Image) -> Array:
     counts = np.convolve(counts, np.ones(3), "same")
     best = int(counts.argmax())
     w = np.array([2.0 / (edges[best] + edges[best + 1]), 0.0, 0.0])
+    inverse, weight = 1.0 / z, z**4  # of inverse depth, an error of z weighs as 1/z²
     for scale in (2e-3, 1.5e-3, 1e-3, 0.7e-3, 0.7e-3, 0.5e-3, 0.5e-3):
-        # of inverse depth, an error of z weighs as 1/z²
         off = z - 1.0 / (A @ w)
-        trust = np.square(np.maximum(1.0 - (off / (3 * scale)) ** 2, 0.0)) * z**4
+        trust = np.square(np.maximum(1.0 - (off / (3 * scale)) ** 2, 0.0)) * weight
         AW = A * trust[:, None]
-        w = np.linalg.solve(AW.T @ A + 1e-12 * np.eye(3) * trust.sum(), AW.T @ (1.0 / z))
+        w = np.linalg.solve(AW.T @ A + 1e-12 * np.eye(3) * trust.sum(), AW.T @ inverse)
     return w
 
 

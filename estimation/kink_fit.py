@@ -11,6 +11,9 @@ Where a membrane that leaves the face smoothly explains the pixels nearly as wel
 
 from __future__ import annotations
 
+from functools import cache
+from math import cos, sin
+
 import cv2
 import numpy as np
 
@@ -18,7 +21,6 @@ from estimation import strip_kernels as kernels
 from estimation.alignment import Systematic
 from estimation.deformation import Deformation
 from estimation.tactile_pose import FingerModel, GraspPrior, left_difference, left_moved
-from mechanics import se2
 from mechanics.polygon import Polygon
 from mechanics.readings import Array
 
@@ -49,9 +51,11 @@ class KinkFit:
 
     def __init__(self, finger: FingerModel, outline: Polygon, field: Deformation, prior: GraspPrior, pose: Array):
         self.pose = pose
-        self._finger, self._outline, self._field, self._prior = finger, outline, field, prior
-        sides = np.roll(outline.vertices, -1, axis=0) - outline.vertices
-        self._n = len(sides)
+        self._finger, self._vertices, self._field, self._prior = finger, outline.vertices, field, prior
+        self._n = len(self._vertices)
+        self._next = np.roll(np.arange(self._n), -1)
+        self._lines = self._lines_at(pose)
+        sides = self._vertices[self._next] - self._vertices
         strips = np.ceil(np.linalg.norm(sides, axis=1) / WIDTH).astype(np.int64)
         self._starts = np.concatenate(([0], np.cumsum(strips)))
         self._first = 6 + 3 * self._n
@@ -61,7 +65,8 @@ class KinkFit:
         #: which strips have an edge to show
         self.active = np.ones(count, bool)
         self._seen, self._costs = np.zeros((count, 3)), np.zeros(count)
-        self._H, self._g = np.zeros((self._first + count,) * 2), np.zeros(self._first + count)
+        self._edge_of = np.repeat(np.arange(self._n), strips)
+        self._known = prior.information
         self._sigma = max(field.noise, 0.05e-3)
         self._window = np.array([WITHIN, OUTSIDE, CORNER, 0.5 * field.pitch])
         self._gather()
@@ -102,7 +107,7 @@ class KinkFit:
     def information(self) -> Array:
         """Information (3, 3) of the picture alone on Δ, everything else integrated out."""
         H = self._left
-        own = H[:3, :3] - self._prior.information
+        own = H[:3, :3] - self._known
         information = own - H[:3, 3:] @ kernels.solve_positive(H[3:, 3:].copy(), H[3:, :3].copy())
         values, vectors = np.linalg.eigh(0.5 * (information + information.T))
         information = (vectors * np.maximum(values, 0.0)) @ vectors.T
@@ -114,7 +119,7 @@ class KinkFit:
         """Where strips show a kink (m, 2) [m], in ee."""
         strips = np.flatnonzero(self.active)
         edge = np.searchsorted(self._starts, strips, side="right") - 1
-        lines = self._lines()[edge]
+        lines = self._lines[edge]
         along = np.minimum((strips - self._starts[edge] + 0.5) * WIDTH, lines[:, 4])
         outward = np.column_stack((lines[:, 3], -lines[:, 2]))
         off = self._own[edge, 0] + self._own[edge, 1] * (along - 0.5 * lines[:, 4])
@@ -137,15 +142,21 @@ class KinkFit:
     def _assign(self) -> None:
         edges = np.empty(len(self._all), np.int64)
         slack = 1e-3
-        kernels.nearest_edges(self._all, self._lines(), WITHIN + slack, OUTSIDE + slack, 0.5 * CORNER, edges)
+        kernels.nearest_edges(self._all, self._lines, WITHIN + slack, OUTSIDE + slack, 0.5 * CORNER, edges)
         on = edges >= 0
         self._pixels = self._all[on], self._all_rays[on], self._all_values[on], edges[on]
 
-    def _lines(self) -> Array:
-        v = se2.transform(self.pose, self._outline.vertices)
-        side = np.roll(v, -1, axis=0) - v
-        length = np.linalg.norm(side, axis=1, keepdims=True)
-        return np.hstack((v, side / length, length))
+    def _lines_at(self, pose: Array) -> Array:
+        """The outline's edges (n, 5) at a pose, as `estimation.strip_kernels` has them."""
+        x, y, theta = pose.tolist()
+        c, s = cos(theta), sin(theta)
+        u, v = self._vertices[:, 0], self._vertices[:, 1]
+        out = np.empty((self._n, 5))
+        out[:, 0], out[:, 1] = x + (c * u - s * v), y + (s * u + c * v)
+        side = out[self._next, :2] - out[:, :2]
+        out[:, 4] = np.sqrt(side[:, 0] ** 2 + side[:, 1] ** 2)
+        out[:, 2:4] = side / out[:, 4:]
+        return out
 
     def _choose(self) -> None:
         """Strips that are seen on both sides and flat within."""
@@ -161,7 +172,7 @@ class KinkFit:
 
     def _bend(self) -> None:
         """How the untouched membrane is curved about each edge."""
-        lines = self._lines()
+        lines = self._lines
         for k in range(self._n):
             here = np.flatnonzero(self.active[self._starts[k] : self._starts[k + 1]])
             if len(here) and not self._base[k]:
@@ -173,51 +184,51 @@ class KinkFit:
     # -- equations ---------------------------------------------------------------------------------------------------
 
     def _constrain(self) -> None:
-        """Which unknowns there are, and what is known of them beforehand: their information (u, u)."""
-        first, active = self._first, self.active
-        R = np.zeros_like(self._H)
-        R[(3, 4, 5), (3, 4, 5)] = PLANE_SPREAD**-2
-        edge_of = np.repeat(np.arange(self._n), np.diff(self._starts))
+        """Which unknowns there are, and what is known of them beforehand: their information (m, m)."""
+        first, active, edge_of = self._first, self.active, self._edge_of
         shown = np.bincount(edge_of[active], minlength=self._n) > 0
-        R[range(6, first, 3), range(6, first, 3)] = SYSTEMATIC.offset**-2
-        R[range(7, first, 3), range(7, first, 3)] = SYSTEMATIC.tilt**-2
-        curved = 8 + 3 * np.flatnonzero(shown)
-        m = len(curved)
-        R[np.ix_(curved, curved)] = np.linalg.inv(
-            PRESSURE_SPREAD**2 * np.ones((m, m)) + CURVATURE_SPREAD**2 * np.eye(m)
-        )
+        used = np.flatnonzero(np.concatenate((np.ones(6, bool), np.repeat(shown, 3), active)))
+        place = np.full(first + len(active), -1)
+        place[used] = np.arange(len(used))
+        R = np.zeros((len(used), len(used)))
+        R[(3, 4, 5), (3, 4, 5)] = PLANE_SPREAD**-2
+        own = place[6 + 3 * np.flatnonzero(shown)]
+        R[own, own] = SYSTEMATIC.offset**-2
+        R[own + 1, own + 1] = SYSTEMATIC.tilt**-2
+        R[own[:, None] + 2, own + 2] = _curvatures(len(own))
         middle = 1 + np.flatnonzero(active[:-2] & active[1:-1] & active[2:] & (edge_of[:-2] == edge_of[2:]))
-        for i in range(3):
-            for j in range(3):
-                R[first + middle + i - 1, first + middle + j - 1] += BEND[i, j] * SLOPE_BEND**-2
-        strips = np.arange(first, len(R))
+        at = place[first + middle]  # its neighbours are there, too, and stand beside it
+        for i in (-1, 0, 1):
+            for j in (-1, 0, 1):
+                R[at + i, at + j] += BEND[i + 1, j + 1] * SLOPE_BEND**-2
+        strips = np.arange(6 + 3 * len(own), len(used))
         R[strips, strips] += 1.0
-        self._R = R
-        self._used = np.flatnonzero(np.concatenate((np.ones(6, bool), np.repeat(shown, 3), active)))
+        self._R, self._used, self._place = R, used, place
 
     def _step(self, widened: float) -> Array:
         """One Gauss–Newton step of all unknowns, residuals counting up to four ``widened`` standard deviations."""
         points, rays, values, edges = self._pixels
         trust = 1.0 / (self._sigma**2 * self._field.alike)
+        used, R = self._used, self._R
+        H, g = np.empty_like(R), np.empty(len(used))
         kernels.kink_equations(
-            points, rays, values, edges, self._lines(), self._starts, WIDTH, self._slopes, self._own, self._plane,
-            self.active, self._window, trust, 4.0 * widened * self._sigma, self._H, self._g, self._seen, self._costs
+            points, rays, values, edges, self._lines, self._starts, WIDTH, self._slopes, self._own, self._plane,
+            self.active, self._window, trust, 4.0 * widened * self._sigma, self._place, H, g, self._seen, self._costs
         )  # fmt: skip
         away = np.concatenate((np.zeros(3), self._plane, self._own.ravel(), self._slopes - USUAL_SLOPE))
         away[8 : self._first : 3] -= self._base + PRESSURE
-        used = self._used
-        R = self._R[np.ix_(used, used)]
-        H = self._H[np.ix_(used, used)] + R
-        g = self._g[used] - R @ away[used]
-        H[:3, :3] += self._prior.information
-        g[:3] -= self._prior.information @ left_difference(self.pose, self._prior.pose)
+        H += R
+        g -= R @ away[used]
+        H[:3, :3] += self._known
+        g[:3] -= self._known @ left_difference(self.pose, self._prior.pose)
         self._left = H
-        step = np.zeros_like(self._g)
-        step[used] = kernels.solve_positive(H.copy(), g[:, None].copy())[:, 0]
+        step = np.zeros(len(away))
+        step[used] = kernels.solve_positive(H.copy(), g[:, None])[:, 0]
         return step
 
     def _move(self, step: Array) -> None:
         self.pose = left_moved(self.pose, step[:3])
+        self._lines = self._lines_at(self.pose)
         self._plane = self._plane + step[3:6]
         self._own = self._own + step[6 : self._first].reshape(-1, 3)
         self._own[:, 2] = np.clip(self._own[:, 2], 0.0, 400.0)
@@ -228,7 +239,7 @@ class KinkFit:
         points, rays, values, edges = self._pixels
         smooth = np.zeros((len(self._slopes), len(DEPARTURES)))
         kernels.departure_costs(
-            points, rays, values, edges, self._lines(), self._starts, WIDTH, self._own, self._plane, self.active,
+            points, rays, values, edges, self._lines, self._starts, WIDTH, self._own, self._plane, self.active,
             self._window, 1.0 / (self._sigma**2 * self._field.alike), 4.0 * self._sigma, DEPARTURES, smooth
         )  # fmt: skip
         gain = np.where(self.active, smooth.min(axis=1) - self._costs, 0.0)
@@ -236,3 +247,10 @@ class KinkFit:
         dropped = bool((self.active & false).any())
         self.active &= ~false
         return dropped
+
+
+@cache
+def _curvatures(edges: int) -> Array:
+    """What is known of the curvatures of so many edges, which have the gas in common: their information."""
+    covariance = PRESSURE_SPREAD**2 * np.ones((edges, edges)) + CURVATURE_SPREAD**2 * np.eye(edges)
+    return np.asarray(np.linalg.inv(covariance), np.float64)

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def ridge_scores(picture, to_pixels, points, normals, faces, poses, reach, least, cap, level, out):
     """Score (k,) of each of ``poses`` (k, 3): how much of a ridge of ``picture`` lies under the moved outline.
 
@@ -58,7 +58,7 @@ def ridge_scores(picture, to_pixels, points, normals, faces, poses, reach, least
         out[k] = total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def nearest_edges(points, lines, within, outside, corner, edges):
     """Index of each point's nearest edge into ``edges`` (m,).
 
@@ -79,7 +79,7 @@ def nearest_edges(points, lines, within, outside, corner, edges):
         edges[i] = edge if place > corner and -within < side < outside else -1
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always", error_model="numpy")
 def _from_edge(x, y, line, own, window):
     """How far a point is along its edge and beyond it [m], and whether both lie within the window."""
     along = (x - line[0]) * line[2] + (y - line[1]) * line[3]
@@ -89,7 +89,7 @@ def _from_edge(x, y, line, own, window):
     return along, a, inside
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def kink_equations(
     points,
     rays,
@@ -105,29 +105,31 @@ def kink_equations(
     window,
     trust,
     gate,
+    place,
     H,
     g,
     seen,
     costs,
 ):
-    """Normal equations H (u, u), g (u,) of the kink's model, linearised at the present values.
+    """Normal equations H (m, m), g (m,) of the kink's model, linearised at the present values.
 
     The model at a point (m, 2) is the ``plane`` (3,) plus, outside, s a − c a²/2, with a the distance from the edge, s
     the slope of its strip and c the curvature of its edge. ``rays`` (m, 2) is how far a point moves as its depth grows.
     Unknowns: the pose's Δ (3), the plane (3), then (offset, tilt, c) = ``own`` (n, 3) for each edge, then s for each
-    strip. ``starts`` (n + 1,) number each edge's strips, ``width`` [m] wide, from its first vertex. ``window`` (4,)
-    [m]: how far inside and outside points count, how near an edge's ends not, how far the kink is spread. ``trust`` is
-    a point's information, ``gate`` [m] where a residual's weight ends.
+    strip; ``place`` (u,) says where each stands in H and g, −1: not at all. ``starts`` (n + 1,) number each edge's
+    strips, ``width`` [m] wide, from its first vertex. ``window`` (4,) [m]: how far inside and outside points count, how
+    near an edge's ends not, how far the kink is spread. ``trust`` is a point's information, ``gate`` [m] where a
+    residual's weight ends.
 
     ``seen`` (strips, 3): sum of the residuals within, how many, and how many points are outside; ``costs`` (strips,):
     minus the logarithm of their likelihood.
     """
-    n = lines.shape[0]
-    H[:] = 0.0
-    g[:] = 0.0
+    n, strips = lines.shape[0], slopes.shape[0]
     seen[:] = 0.0
     costs[:] = 0.0
-    index = np.empty(10, np.int64)
+    # H has few entries: those of the plane and the Δ with each other, and the rows of each edge and of each strip, in
+    # which an edge stands only with itself. The last column is g's
+    shared, of_edge, of_strip = np.zeros((6, 7)), np.zeros((n, 3, 10)), np.zeros((strips, 11))
     J = np.empty(10)
     soft = window[3]
     for i in range(points.shape[0]):
@@ -167,34 +169,61 @@ def kink_equations(
         if rest == 0.0:
             continue
         weight = trust * rest * rest
-        index[0], index[1], index[2] = 3, 4, 5
         J[0], J[1], J[2] = 1.0, x, y
-        count = 3
+        # a view of a row would cost more than its sums
+        for p in range(3):
+            wj = weight * J[p]
+            for q in range(p + 1):
+                shared[p, q] += wj * J[q]
+            shared[p, 6] += wj * r
         if step > 0.0:
             # an edge that moves outward by one takes one from a
             slope = (s - c * at) * step * stretch
-            index[3], index[4], index[5] = 0, 1, 2
             J[3], J[4], J[5] = -slope * ty, slope * tx, slope * (ty * y + tx * x)
-            first = 6 + 3 * k
-            index[6], index[7], index[8] = first, first + 1, first + 2
             J[6], J[7], J[8] = -slope, -slope * (along - 0.5 * length), -0.5 * at * at * stretch
-            index[9] = 6 + 3 * n + strip
             J[9] = at * stretch
-            count = 10
-        for p in range(count):
-            wj = weight * J[p]
-            g[index[p]] += wj * r
-            for q in range(p + 1):
-                H[index[p], index[q]] += wj * J[q]
-    # the pairs were added once each, in either triangle
-    for p in range(H.shape[0]):
-        for q in range(p):
-            total = H[p, q] + H[q, p]
-            H[p, q] = total
-            H[q, p] = total
+            for p in range(3, 6):
+                wj = weight * J[p]
+                for q in range(p + 1):
+                    shared[p, q] += wj * J[q]
+                shared[p, 6] += wj * r
+            for p in range(6, 9):
+                wj = weight * J[p]
+                for q in range(p + 1):
+                    of_edge[k, p - 6, q] += wj * J[q]
+                of_edge[k, p - 6, 9] += wj * r
+            wj = weight * J[9]
+            for q in range(10):
+                of_strip[strip, q] += wj * J[q]
+            of_strip[strip, 10] += wj * r
+    H[:] = 0.0
+    g[:] = 0.0
+    index = np.array([3, 4, 5, 0, 1, 2, 0, 0, 0, 0])
+    _spread(shared, 0, index, place, H, g)
+    for k in range(n):
+        for p in range(3):
+            index[6 + p] = 6 + 3 * k + p
+        _spread(of_edge[k], 6, index, place, H, g)
+        for strip in range(starts[k], starts[k + 1]):
+            index[9] = 6 + 3 * n + strip
+            _spread(of_strip[strip : strip + 1], 9, index, place, H, g)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
+def _spread(sums, first, index, place, H, g):
+    """Put the sums of rows from ``first`` on to where their unknowns, by ``index``, stand in H and g."""
+    for p in range(sums.shape[0]):
+        at = place[index[first + p]]
+        if at < 0:
+            continue
+        g[at] = sums[p, -1]
+        for q in range(first + p + 1):
+            to = place[index[q]]
+            H[at, to] = sums[p, q]
+            H[to, at] = sums[p, q]
+
+
+@njit(cache=True, error_model="numpy")
 def departure_costs(
     points, rays, values, edges, lines, starts, width, own, plane, active, window, trust, gate, places, costs
 ):
@@ -225,7 +254,7 @@ def departure_costs(
             costs[strip, j] += trust * gate * gate / 6 * (1.0 - rest * rest * rest)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def solve_positive(A, B):
     """X (n, k) with A X = B (n, k) for a symmetric positive definite A (n, n), by Cholesky; A and B are overwritten.
 

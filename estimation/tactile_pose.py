@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from math import cos, sin
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -184,9 +185,18 @@ def fuse(prior: GraspPrior, poses: Sequence[TactilePose]) -> TactilePose:
 
 def left_difference(pose: Array, origin: Array) -> Array:
     """Δ (3,) with ``pose`` = Δ ∘ ``origin``."""
-    return se2.compose(pose, se2.inverse(origin))
+    # in scalars, as `se2` would have it: asked for thousands of times a trial
+    (x, y, theta), (u, v, phi) = pose.tolist(), origin.tolist()
+    c, s = cos(phi), sin(phi)
+    u, v = -c * u - s * v, s * u - c * v
+    c, s = cos(theta), sin(theta)
+    return np.array([x + c * u - s * v, y + s * u + c * v, theta - phi])
 
 
 def left_moved(pose: Array, delta: Array) -> Array:
-    """Δ ∘ ``pose``."""
-    return se2.compose(delta, pose)
+    """Δ ∘ ``pose``, (..., 3) for ``delta`` (..., 3)."""
+    if delta.ndim > 1:
+        return se2.compose(delta, pose)
+    (x, y, theta), (u, v, phi) = delta.tolist(), pose.tolist()
+    c, s = cos(theta), sin(theta)
+    return np.array([x + c * u - s * v, y + s * u + c * v, theta + phi])

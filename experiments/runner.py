@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,7 @@ class Outcome:
 def run(resolved: Resolved, out: Path | None = None, console: Console | None = None) -> Outcome:
     """Run an experiment. Raises InputError before anything was started; every later end is in the outcome."""
     console = console or Console(stderr=True)
+    _keep_what_is_here()
     calibrations = store.load(resolved)
     check(resolved, calibrations, feasible=False)  # bad input is found before anything is written
     folder = RunFolder.create(resolved.experiment.name, out)
@@ -77,6 +80,12 @@ def run(resolved: Resolved, out: Path | None = None, console: Console | None = N
         outcome = Outcome(code, folder, results, reason)
         _finish(outcome, console)
     return outcome
+
+
+@cache
+def _keep_what_is_here() -> None:
+    """What was imported stays: to look through it for garbage, again and again, costs seconds of a run."""
+    gc.freeze()
 
 
 def _stages(

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from drivers.errors import DeviceFault, DeviceTimeout, NotConnected, ProtocolError
 from drivers.fault import Fault
 from drivers.interfaces import Sensor, _Stamped
-from mechanics.readings import GripperReading, PoseReading, Status, WrenchReading
+from mechanics.readings import GripperReading, PoseReading, Stamp, Status, WrenchReading
 
 R = TypeVar("R", bound=_Stamped)
 
@@ -404,4 +404,8 @@ def _marked(reading: R, status: Status) -> R:
 
 def received(reading: R, now_ns: int) -> R:
     """The reading with the instant of its arrival in its stamp."""
-    return replace(reading, stamp=replace(reading.stamp, receive_ns=now_ns))  # pyright: ignore[reportArgumentType]
+    old = reading.stamp
+    stamp = Stamp(old.capture_ns, now_ns, old.sequence, old.frame, old.status)
+    if isinstance(reading, WrenchReading):  # by the thousand, and `replace` takes its time
+        return WrenchReading(stamp, reading.wrench)  # pyright: ignore[reportReturnType]
+    return replace(reading, stamp=stamp)  # pyright: ignore[reportArgumentType]

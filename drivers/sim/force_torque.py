@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from math import cos, sin, sqrt
+from operator import gt
 
 import numpy as np
 
@@ -41,8 +42,11 @@ class Electronics:
             [figures.temperature_force, figures.temperature_torque], 3
         ) * own.standard_normal(6)
         self._gain_by_kelvin = figures.temperature_gain * own.standard_normal(6)
-        self._resolution = np.array(figures.resolution)
-        self._step = np.where(self._resolution > 0, self._resolution, 1.0)
+        resolution = np.array(figures.resolution)
+        self._step = np.where(resolution > 0, resolution, 1.0)
+        #: which axes are digital
+        self._digital, self._all_digital = resolution > 0, bool((resolution > 0).all())
+        self._any_digital = bool((resolution > 0).any())
         self._drift, self._warmth = self._bias, 0.0
         self._next = BLOCK
         #: whether the digits differ from the load at all; full scale aside
@@ -59,11 +63,12 @@ class Electronics:
                 self._draw()
             load = load * self._gains[self._next] + self._zeros[self._next]
             self._next += 1
-        saturated = bool((np.abs(load) > RANGE).any())
+        saturated = any(map(gt, map(abs, load.tolist()), RANGE))
         if saturated:
             load = np.clip(load, np.negative(RANGE), RANGE)
-        if self._resolution.any():
-            load = np.where(self._resolution > 0, np.rint(load / self._step) * self._step, load)
+        if self._any_digital:
+            digits = np.rint(load / self._step) * self._step
+            load = digits if self._all_digital else np.where(self._digital, digits, load)
         return load, saturated
 
     def _draw(self) -> None:

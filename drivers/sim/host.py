@@ -243,7 +243,8 @@ class Host:
         if span_ns < 0:
             raise CommandRefused(topics.WORLD, "advance", "time does not run backwards", "Ask for a positive time")
         self.world.plant("world", "advance")
-        self._step(span_ns)
+        with self.desk.together():
+            self._step(span_ns)
 
     def _regrasp(self, payload: bytes) -> None:
         self.world.regrasp(messages.decode(payload, messages.INTEGER).data)

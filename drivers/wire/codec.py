@@ -56,9 +56,9 @@ def encode_reading(reading: Reading, shift_ns: int = 0) -> bytes:
     stamp = reading.stamp
     capture_ns = stamp.capture_ns + shift_ns
     if isinstance(reading, WrenchReading):
-        return _pack(capture_ns, stamp.frame, reading.wrench)
+        return _pack(capture_ns, stamp.frame, reading.wrench.tolist())
     if isinstance(reading, PoseReading):
-        x, y, theta = reading.pose
+        x, y, theta = reading.pose.tolist()
         half = 0.5 * theta
         return _pack(capture_ns, stamp.frame, (x, 0.0, y, 0.0, -math.sin(half), 0.0, math.cos(half)))
     return messages.encode(_ENCODERS[type(reading)](reading, messages.header(capture_ns, stamp.frame)))

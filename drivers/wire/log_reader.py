@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Collection, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
 import zstandard
-from mcap.exceptions import InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Footer, McapRecord, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
 
 from drivers.errors import ProtocolError
 from drivers.wire import messages
@@ -20,6 +23,8 @@ from drivers.wire.records import STREAMS, Record, decode_record
 _READINGS = {*TYPES.values(), messages.COMPRESSED_IMAGE}
 _RECORDS = {type_name for _, type_name in STREAMS.values()}
 _LARGEST = 2**30
+# of an MCAP record: opcode and length; of a message: channel, sequence, time of logging, time of publishing
+_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 _BROKEN = (McapError, struct.error, zstandard.ZstdError, UnicodeDecodeError, MemoryError, OverflowError)
 
 
@@ -104,9 +109,13 @@ class LogReader:
         closed = False
         with self.path.open("rb") as file:
             try:
-                for record in StreamReader(file, validate_crcs=True, record_size_limit=_LARGEST).records:
+                reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST)
+                for record in reader.records:
                     closed = closed or isinstance(record, Footer)
-                    yield record
+                    if isinstance(record, Chunk):
+                        yield from _within(record)
+                    else:
+                        yield record
             except InvalidMagic:
                 self.ending = f"torn at byte {file.tell()}: the end is missing"
             except CRCValidationError as error:
@@ -122,3 +131,27 @@ class LogReader:
                 self.ending = f"torn at byte {file.tell()}: {str(error) or 'the file ends within a record'}"
             else:
                 self.ending = "complete" if closed else f"torn at byte {file.tell()}: no footer"
+
+
+def _within(chunk: Chunk) -> list[McapRecord]:
+    """What is in a chunk, all of it or nothing. A log is a hundred thousand small messages: the library takes its time.
+
+    Raises what the library does for a chunk that is damaged.
+    """
+    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    data, at = stream.read(size), 0
+    records: list[McapRecord] = []
+    while at < size:
+        opcode, length = _RECORD.unpack_from(data, at)
+        begin, at = at + _RECORD.size, at + _RECORD.size + length
+        if at > size:
+            raise EndOfFile
+        if opcode == Opcode.MESSAGE:
+            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, begin)
+            payload = data[begin + _MESSAGE.size : at]
+            records.append(Message(channel, log_time, payload, publish_time, sequence))
+        elif opcode == Opcode.CHANNEL:
+            records.append(Channel.read(ReadDataStream(BytesIO(data[begin:at]))))
+        elif opcode == Opcode.SCHEMA:
+            records.append(Schema.read(ReadDataStream(BytesIO(data[begin:at]))))
+    return records

@@ -7,7 +7,7 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Self
@@ -28,7 +28,7 @@ from drivers.wire import messages, topics
 from drivers.wire.bus import Bus, Query
 from drivers.wire.codec import Reading, encode_compressed, encode_reading
 from drivers.wire.lease import TIME_TO_LIVE
-from drivers.wire.streams import Publisher
+from drivers.wire.streams import Outbox, Publisher
 from mechanics.readings import ImageReading, Stamp
 
 log = logging.getLogger(__name__)
@@ -103,11 +103,13 @@ class Desk:
         self.lockstep, self.lease = lockstep, lease
         self.publishers: list[Publisher] = []
         self._lossless: list[Publisher] = []
+        self._outbox = Outbox()
 
     def publisher(self, device: str, stream: str, type_name: str) -> Publisher:
         """Announce a stream. Images may be dropped on their way to a slow viewer, everything else arrives."""
         lossy = not self.lockstep and type_name in (messages.IMAGE, messages.COMPRESSED_IMAGE)
         publisher = self.bus.publisher(topics.key(self.station, device, stream), type_name, lossy)
+        publisher.outbox = self._outbox
         for old in [known for known in self.publishers if known.topic == publisher.topic]:
             # a device that comes back goes on with its stream
             publisher.count, publisher.newest = old.count, old.newest
@@ -135,6 +137,16 @@ class Desk:
 
         return self.bus.serve(topics.key(self.station, device, verb), handle)
 
+    @contextlib.contextmanager
+    def together(self) -> Iterator[None]:
+        """What the owner's thread publishes meanwhile leaves at the end of it, or before the next reply."""
+        self._outbox.open = True
+        try:
+            yield
+        finally:
+            self._outbox.open = False
+            self._outbox.send()
+
     def counts(self) -> dict[str, int]:
         """Messages published per topic since `restart`."""
         return {publisher.topic: publisher.count for publisher in self.publishers}
@@ -157,6 +169,8 @@ class Desk:
             log.exception("%s: %s failed", device, verb)
             error = DeviceFault(device, verb, f"{type(problem).__name__}: {problem}", "This is a defect; report it")
             outcome = 2
+        if streams and self._outbox.open:  # urgent work, in the midst of something longer
+            self._outbox.send()
         published = [
             messages.message("extrinsic_msgs/msg/Progress", topic=publisher.topic, sequence=publisher.newest)
             for publisher, before in zip(streams, counts, strict=False)

@@ -28,12 +28,46 @@ class Sample:
         self.reading: object = None  # decoded by who reads it first
 
 
+class Outbox:
+    """Keeps back what several streams put, and sends it at once and in its order: one wake-up for many messages.
+
+    One thread puts and sends. While it is `open`, whether anybody listens is asked once for each stream.
+    """
+
+    def __init__(self) -> None:
+        self.open = False
+        self._waiting: list[tuple[zenoh.Publisher, bytes, bytes]] = []
+        self._matched: dict[Publisher, bool] = {}
+
+    def put(self, publisher: zenoh.Publisher, payload: bytes, beside: bytes) -> None:
+        """Keep a message until `send`."""
+        self._waiting.append((publisher, payload, beside))
+
+    def matched(self, publisher: Publisher) -> bool:
+        """Whether somebody listened when this was asked first since the last `send`."""
+        found = self._matched.get(publisher)
+        if found is None:
+            found = self._matched[publisher] = publisher.heard()
+        return found
+
+    def send(self) -> None:
+        """Send what waits."""
+        self._matched.clear()
+        waiting, self._waiting = self._waiting, []
+        for publisher, payload, beside in waiting:
+            publisher.put(payload, attachment=beside)
+
+
 class Publisher:
-    """A stream on the bus. ``count`` messages were put on it, the newest with sequence number ``newest``."""
+    """A stream on the bus. ``count`` messages were put on it, the newest with sequence number ``newest``.
+
+    With an ``outbox`` that is open messages leave when that sends them.
+    """
 
     def __init__(self, session: zenoh.Session, topic: str, type_name: str, lossy: bool, withdraw: Callable[[], None]):
         self.topic, self.type_name = topic, type_name
         self.count, self.newest = 0, -1
+        self.outbox = Outbox()
         control = zenoh.CongestionControl.DROP if lossy else zenoh.CongestionControl.BLOCK
         self._publisher = session.declare_publisher(
             topic,
@@ -45,6 +79,10 @@ class Publisher:
     @property
     def matched(self) -> bool:
         """Whether anybody listens; a stream that nobody hears need not be encoded."""
+        return self.outbox.matched(self) if self.outbox.open else self.heard()
+
+    def heard(self) -> bool:
+        """Whether anybody listens at this moment."""
         return matching(self._publisher)
 
     def wait_matched(self, timeout: float, wanted: bool = True) -> bool:
@@ -53,12 +91,18 @@ class Publisher:
 
     def put(self, payload: bytes, sequence: int, capture_ns: int, status: int = 0) -> None:
         """Publish one message."""
-        self._publisher.put(payload, attachment=ATTACHMENT.pack(sequence, capture_ns, status))
+        beside = ATTACHMENT.pack(sequence, capture_ns, status)
+        if self.outbox.open:
+            self.outbox.put(self._publisher, payload, beside)
+        else:
+            self._publisher.put(payload, attachment=beside)
         self.count += 1
         self.newest = sequence
 
     def close(self) -> None:
         """Withdraw the stream; idempotent."""
+        if self.outbox.open:
+            self.outbox.send()
         self._withdraw()
         undeclare(self._publisher)
 

@@ -15,6 +15,7 @@ from estimation.tactile_pose import (
     left_moved,
     open_directions,
 )
+from mechanics import se2
 from mechanics.camera import CameraModel
 
 CAMERA = CameraModel(224, 171, np.array([[186.0, 0, 111.5], [0, 186.0, 85.0], [0, 0, 1]]))
@@ -106,3 +107,17 @@ def test_a_turn_about_the_grasp_centre_moves_nothing_there() -> None:
     # a point of the object that was at ee's origin stays there
     z = complex(*pose[:2]) + np.exp(1j * pose[2]) * complex(-0.01, 0.045)
     assert abs(z) < 1e-12
+
+
+def test_left_perturbations_are_those_of_the_group() -> None:
+    rng = np.random.default_rng(0)
+    for pose, origin, delta in rng.uniform(-2.0, 2.0, (50, 3, 3)):
+        np.testing.assert_allclose(
+            se2.matrix(left_difference(pose, origin)),
+            se2.matrix(pose) @ np.linalg.inv(se2.matrix(origin)),
+            atol=1e-14,
+        )
+        np.testing.assert_allclose(
+            se2.matrix(left_moved(pose, delta)), se2.matrix(delta) @ se2.matrix(pose), atol=1e-14
+        )
+        np.testing.assert_array_equal(left_moved(pose, delta[None])[0], left_moved(pose, delta))

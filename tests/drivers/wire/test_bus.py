@@ -12,6 +12,8 @@ import zenoh
 from drivers.errors import DeviceFault, DeviceTimeout, NotConnected
 from drivers.wire import messages, topics
 from drivers.wire.bus import Bus, Query, open_buses
+from drivers.wire.link import Link
+from drivers.wire.server import Desk
 from drivers.wire.streams import ATTACHMENT, Sample
 from drivers.wire.watch import Watch, wait_matching
 
@@ -28,6 +30,50 @@ def test_what_is_published_arrives_whole_and_in_order(served: Bus, joined: Bus) 
     assert [s.sequence for s in got] == list(range(2000))
     assert all(s.payload == bytes([s.sequence % 256]) * 80 and s.capture_ns == 10 * s.sequence for s in got)
     assert publisher.count == subscription.count == 2000
+
+
+def test_what_is_published_together_leaves_at_the_end_whole_and_in_order(desk: Desk, joined: Bus) -> None:
+    publisher = desk.publisher("ft", "wrench", messages.WRENCH)
+    beside = desk.bus.publisher("lab/arm/pose", messages.POSE)
+    got: list[Sample] = []
+    subscription, other = joined.subscribe("lab/ft/wrench"), joined.subscribe("lab/arm/pose")
+    subscription.listen(got.append)
+    other.listen(lambda _: None)
+    assert publisher.wait_matched(5.0)
+    assert beside.wait_matched(5.0)
+    with desk.together():
+        for i in range(300):
+            publisher.put(bytes([i % 256]) * 80, i, 10 * i)
+        beside.put(b"x", 0, 0)
+        assert other.wait(0, None, time.monotonic() + 5)  # what does leave is not held up
+        assert got == []
+    assert subscription.wait(299, None, time.monotonic() + 5)
+    assert [s.sequence for s in got] == list(range(300))
+    publisher.put(b"y", 300, 0)
+    assert subscription.wait(300, None, time.monotonic() + 5)
+
+
+def test_a_reply_in_the_midst_of_much_comes_after_what_was_published_before_it(desk: Desk, link: Link) -> None:
+    publisher = desk.publisher("ft", "wrench", messages.WRENCH)
+    stop = desk.serve("ft", "tare", lambda _: publisher.put(b"x", 0, 0))
+    subscription = link.bus.subscribe("lab/ft/wrench")
+    subscription.listen(lambda _: None)
+    assert publisher.wait_matched(5.0)
+    with desk.together():
+        link.ask("ft", "tare")
+        assert subscription.newest == 0
+    stop()
+
+
+def test_a_stream_that_is_withdrawn_in_the_midst_has_sent_what_waited(desk: Desk, joined: Bus) -> None:
+    publisher = desk.publisher("ft", "wrench", messages.WRENCH)
+    subscription = joined.subscribe("lab/ft/wrench")
+    subscription.listen(lambda _: None)
+    assert publisher.wait_matched(5.0)
+    with desk.together():
+        publisher.put(b"x", 0, 0)
+        publisher.close()
+    assert subscription.wait(0, None, time.monotonic() + 5)
 
 
 def test_a_stream_that_nobody_hears_is_not_matched(served: Bus, joined: Bus) -> None:
