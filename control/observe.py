@@ -109,6 +109,9 @@ class Observer:
     def estimate(self) -> PlanarState:
         """What controllers act on, at this instant: from the fingers and the elasticity where there are fingers.
 
+        The wrench is about the grasp centre on the go, as plans and `measure` have it, by the go's pose as felt. An
+        object that lies millimetres off in the fingers turns under another torque about the point where they are.
+
         Raises DeviceFault where no finger has seen the object since the grasp.
         """
         if self.state is None or not self.fingers:
@@ -126,7 +129,8 @@ class Observer:
                 "See to the fingers and the grasp, or take the pose from tags: --set trial.go_pose=tags",
             )
         self.felt = now
-        return PlanarState(now.ee, now.go, None if extrinsic is None else extrinsic.pose, now.wrench)
+        on_go = wrench.about(now.wrench, now.centre, se2.compose(now.go, self.grasp)[:2])
+        return PlanarState(now.ee, now.go, None if extrinsic is None else extrinsic.pose, on_go)
 
     def _feel(self, state: StateEstimator) -> None:
         """Take in one picture of each finger, and what arm and wrist have said until then."""

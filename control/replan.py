@@ -122,7 +122,7 @@ class Belief:
             if self._flat(k):
                 found = self._grasp_of(measured.ee, go, found, force, self._torque(k, measured, found))
             else:
-                force = self._force_at(point, go, found, self._admissible(k, eo, angle, point), measured)
+                force = self._force_at(point, go, self._admissible(k, eo, angle, point), measured)
                 found = self._grasp_of(measured.ee, go, found, force, self._moment_of(go, found, force, point))
         off = found - self.grasp
         off[2] = se2.wrap(off[2])
@@ -281,17 +281,16 @@ class Belief:
         B = np.array(rows)
         return side * np.linalg.lstsq(B, np.array(values), rcond=None)[0], null_space(B, rcond=1e-9)
 
-    def _force_at(
-        self, point: Array, go: Array, grasp: Array, admissible: tuple[Array, Array], measured: PlanarState
-    ) -> Array:
+    def _force_at(self, point: Array, go: Array, admissible: tuple[Array, Array], measured: PlanarState) -> Array:
         """The ``admissible`` force (2,) at ``point`` (2,) on the go that explains the measured wrench best.
 
         Least squares in (f_x, f_y, τ/ρ), by which wrenches are judged: with a lever longer than ρ the torque tells more
         of the force than the force itself does. What no admissible force explains must not be asked of one: the law
-        would trade it for an error of pose for good.
+        would trade it for an error of pose for good. The torque is about the planned grasp centre on the go, as it is
+        told; where the fingers hold the go is another point.
         """
         scale = np.array([1.0, 1.0, 1.0 / self.problem.go_body.rho])
-        centre = se2.transform(go, grasp[:2])
+        centre = se2.transform(go, self.problem.grasp[:2])
         to_point = point - centre
         A = scale[:, None] * np.array([[1.0, 0.0], [0.0, 1.0], [-to_point[1], to_point[0]]])
         b = -scale * (measured.wrench + np.append(self._weight, _moment(go[:2] - centre, self._weight)))

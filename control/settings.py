@@ -29,7 +29,7 @@ class TrialSettings(BaseModel):
         default=1,
         ge=0,
         le=10,
-        description="feedback updates at a waypoint before it is recorded; one at most where a contact slips",
+        description="feedback updates at a waypoint before it is recorded; where a contact slips, one for the next",
     )
     air_corrections: int = Field(default=3, ge=0, le=20, description="pose updates in free air before touch-down")
     preload: float = Field(default=1.0, gt=0, le=30, description="duration of the force ramp at fixed object pose [s]")

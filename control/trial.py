@@ -160,19 +160,26 @@ class Trial:
     def _visit(
         self, controller: Controller, plan: Plan, k: int
     ) -> tuple[PlanarState, Array, PlanarState | None, ContactBelief | None]:
-        """Go to waypoint ``k``, let the controller correct it, and measure once settled."""
+        """Go to waypoint ``k``, let the controller correct it, and measure once settled.
+
+        What slips is moved on, never about: there an update acts in the motion to the next waypoint. A small motion
+        back would leave the contact stuck with less friction than it slips with, and several times as stiff.
+        """
         s, mover = self._settings, self._mover
         mover.ramp(controller.waypoint(k), s.ramp)
         self._settle()
-        # an update moves what slips, and it does not slip back
-        updates = min(s.corrections, 1) if slips(plan) else s.corrections
-        for _ in range(updates if controller.feedback else 0):
+        updates = s.corrections if controller.feedback else 0
+        later = slips(plan)
+        for _ in range(0 if later else updates):
             controller.in_contact(k, self._observer.estimate())
             self._tell_slip()
             mover.ramp(controller.waypoint(k), s.ramp)
             self._settle()
         estimated = self._observer.estimate() if self._observer.fingers else None
         measured = self._observer.measure()
+        if later and updates:
+            controller.in_contact(k, measured if estimated is None else estimated)
+            self._tell_slip()
         self._hear_witness(k, measured)
         return measured, mover.pose, estimated, self._observer.contact()
 

@@ -35,9 +35,10 @@ class State:
     """What is known at ``capture_ns``. Poses (3,) in W; None where nothing is known.
 
     ``go_covariance`` (3, 3) is of a left perturbation of X_ee_go about ee's origin, in ee; ``wrench`` (3,) of the
-    sensor on the go about the grasp centre, where the fingers are, axes of W, with its covariance; ``contact`` where
-    the environment touches the go, in its frame. ``ages`` [s] of each source at ``capture_ns``; ``status`` of the go's
-    pose and its ``reason``.
+    sensor on the go about ``centre`` (2,) in W, axes of W, with its covariance. That is where the fingers are, x⁻¹ from
+    the end-effector: the go's grasp centre only if it lies in them as planned. ``contact`` where the environment
+    touches the go, in its frame. ``ages`` [s] of each source at ``capture_ns``; ``status`` of the go's pose and its
+    ``reason``.
     """
 
     capture_ns: int
@@ -46,6 +47,7 @@ class State:
     go_covariance: Array
     wrench: Array
     wrench_covariance: Array
+    centre: Array
     eo: Array | None = None
     eo_covariance: Array | None = None
     contact: ContactEstimate | None = None
@@ -198,6 +200,7 @@ class StateEstimator:
             prior.covariance,
             w,
             covariance,
+            p_W,
             None if eo is None else eo[1].pose,
             None if eo is None else eo[1].covariance,
             self._contact(at, ee, go, prior.covariance, from_force_torque(w, covariance, go, p_W, self.load)),

@@ -56,6 +56,11 @@ class Electronics:
             if name not in ("latency", "dropout", "tool_mass", "tool_centre_mm", "tool_error")
         )
 
+    def begin_trial(self, rng: np.random.Generator) -> None:
+        """Walk and noise anew, from ``rng``: the same sensor, its zero and its warmth as at the reset."""
+        self._rng = rng
+        self._drift, self._warmth, self._next = self._bias, 0.0, BLOCK
+
     def read(self, load: Array) -> tuple[Array, bool]:
         """Digits (6,) for a load (6,), and whether an axis was at full scale."""
         if not self.perfect:
@@ -146,6 +151,10 @@ class SimForceTorque(Simulated[WrenchReading], ForceTorqueSensor):
         """Begin a new epoch, untared, with a sensor drawn from the profile."""
         super().restart(rng)
         self._set_up(rng)
+
+    def begin_trial(self, rng: np.random.Generator) -> None:
+        """Draw drift, warming and noise from ``rng`` from now on, from where they were at the reset."""
+        self._electronics.begin_trial(rng)
 
     def _make_guard(self) -> Guard:
         figures = self._figures()

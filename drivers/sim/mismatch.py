@@ -1,8 +1,9 @@
 """How far the simulated world is from what the planner believes of it: the mismatch profiles, `profiles/*.yaml`.
 
 A profile is a set of figures. What is constant in a lab (stiffness, friction, the arm's bias, a sensor's gain) is drawn
-once per seed; what no calibration removes (how the object lies in the fingers, the arm's repeatability) is drawn afresh
-per trial, from the seed and the trial's number alone, so that every controller meets the same eight grasps.
+once per seed; what no calibration removes (how the object lies in the fingers, the arm's repeatability, the walk of a
+sensor's zero) is drawn afresh per trial, from the seed and the trial's number alone, so that every controller meets the
+same eight grasps and errors.
 """
 
 from __future__ import annotations

@@ -182,3 +182,28 @@ def test_where_a_contact_slips_the_law_updates_once_at_a_waypoint(mode, updates)
 
     assert station.run(Counting, corrections=2).status == "completed"
     assert steps == sorted([*range(STEPS)] * updates)
+
+
+@pytest.mark.parametrize(("mode", "seen_at"), [(Mode.STICK, 0), (Mode.SLIP_NEGATIVE, 1)])
+def test_where_a_contact_slips_an_update_is_first_seen_at_the_next_waypoint(mode, seen_at):
+    station = Station()
+    station.plan = replace(station.plan, contact_modes=((mode,),) * STEPS)
+    told, lifted = [], np.array([0.0, 2e-4, 0.0])
+
+    class Lifted(ClosedLoop):
+        def in_contact(self, step, measured):
+            told.append(measured)
+            self.correction = lifted
+
+        def in_air(self, go_desired, measured):
+            pass
+
+    assert station.run(Lifted).status == "completed"
+    corrected = [
+        np.abs(waypoint.commanded - station.plan.ee[waypoint.step]).max() > 1e-4 for waypoint in station.waypoints
+    ]
+    assert corrected == [step >= seen_at for step in range(STEPS)]
+    if seen_at:  # made of what is recorded, to the bit
+        assert [measured.wrench.tolist() for measured in told] == [
+            w.measured.wrench.tolist() for w in station.waypoints
+        ]

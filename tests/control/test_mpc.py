@@ -7,14 +7,14 @@ import pytest
 from pydantic import ValidationError
 
 from control.base import CONTROLLERS
-from control.monitor import Deviation
+from control.monitor import Deviation, slips
 from control.mpc import Mpc, MpcSettings
 from mechanics import se2
 from mechanics.records import PlanarState
 from planning.errors import InfeasiblePlan
 from planning.planner import plan
 from planning.skills.base import SKILLS, Held, Scene
-from tests.control.corner_plant import CornerPlant, turn
+from tests.control.corner_plant import CornerPlant, cross, turn
 
 BUBBLE = np.array([[2208.96, -143.31, 399.86], [-143.31, 1875.92, -313.57], [399.86, -313.57, 1608.49]])
 S = np.diag([1, 1, 0.0448])
@@ -32,6 +32,12 @@ LIFTED = np.array([0.0, 0.01, 0.0])
 
 def task_of(skill, **parameters):
     return SKILLS[skill].task(SKILLS[skill].Parameters.model_validate(parameters), Scene(HELD))
+
+
+def about_planned_grasp(plant, go, ee):
+    """The plant's wrench (3,) about where the go should be held: by hand, the true grasp's moved by its lever."""
+    w, lever = plant.wrench(go, ee), turn(go[2]) @ (plant.grasp - HELD.grasp)[:2]
+    return np.append(w[:2], w[2] + cross(lever, w[:2]))
 
 
 class Trial:
@@ -54,7 +60,7 @@ class Trial:
 
     def _told(self, ee, go):
         seen = None if self.blind else go + self.bias
-        return PlanarState(np.array(ee), seen, None, self.plant.wrench(go, ee))
+        return PlanarState(np.array(ee), seen, None, about_planned_grasp(self.plant, go, ee))
 
     @property
     def told(self):
@@ -67,12 +73,16 @@ class Trial:
         return self.plant.place
 
     def visit(self, k):
-        """(go error (3,), ground force error (f_t, f_n)) at waypoint k."""
+        """(go error (3,), ground force error (f_t, f_n)) at waypoint k; what slips is corrected after it."""
         self.plant.move(self.law.waypoint(k))
-        self.law.in_contact(k, self.told)
-        self.plant.move(self.law.waypoint(k))
+        if not slips(self.plan):
+            self.law.in_contact(k, self.told)
+            self.plant.move(self.law.waypoint(k))
         f = self.plan.contact_forces[k, 0]
-        return self.plant.go - self.plan.go[k], self.plant.force - f[::-1]
+        off = self.plant.go - self.plan.go[k], self.plant.force - f[::-1]
+        if slips(self.plan):
+            self.law.in_contact(k, self.told)
+        return off
 
     def run(self):
         go, force = zip(*(self.visit(k) for k in range(self.plan.steps)), strict=True)

@@ -116,7 +116,11 @@ def test_the_wrench_is_about_the_fingers_however_the_object_lies_in_them() -> No
     feed(made, held, 200 * MS, EE, LOADED)
     for at in (150, 180, 200):
         look(made, held, at * MS, EE, LOADED, GOOD)
-    assert made.state().wrench[2] == pytest.approx(LOADED[2], abs=1e-4)
+    state = made.state()
+    assert state.wrench[2] == pytest.approx(LOADED[2], abs=1e-4)
+    assert state.centre == pytest.approx(se2.compose(EE, se2.inverse(np.linalg.solve(K, LOADED)))[:2], abs=1e-6)
+    # and that is not the grasp centre on the object, as planned: 3.6 mm away
+    assert np.hypot(*(se2.compose(state.go, GRASP)[:2] - state.centre)) == pytest.approx(np.hypot(3e-3, 2e-3), rel=0.02)
 
 
 def test_a_tag_newer_than_every_other_reading_is_part_of_the_state() -> None:
