@@ -153,8 +153,13 @@ class SimForceTorque(Simulated[WrenchReading], ForceTorqueSensor):
         self._set_up(rng)
 
     def begin_trial(self, rng: np.random.Generator) -> None:
-        """Draw drift, warming and noise from ``rng`` from now on, from where they were at the reset."""
+        """Draw drift, warming and noise from ``rng`` from now on, from where they were at the reset.
+
+        The zero jumps back by what it has drifted, and nobody is to take that for a fault or into a tare.
+        """
         self._electronics.begin_trial(rng)
+        self._recent.clear()
+        self._guard.restart()
 
     def _make_guard(self) -> Guard:
         figures = self._figures()

@@ -155,3 +155,16 @@ def test_what_a_trials_sensor_says_wrong_hangs_on_seed_and_trial_alone(world_of)
     np.testing.assert_allclose(first, again, atol=1e-9)  # the object swings alike but for rounding
     apart = np.abs(first.mean(axis=0) - other.mean(axis=0))
     assert 1e-3 < apart[:3].max() < 0.06, "another walk of the same zero"
+
+
+def test_a_regrasp_after_much_drift_is_no_fault_of_the_sensor(world_of):
+    world = world_of(profile(force_torque={"noise": (0.01,) * 6, "drift_force": 0.3}))
+    world.regrasp(0)
+    world.advance(60.0)
+    before = world.now_ns()
+    drifted = device(world, "wrist_ft").since(before - 10**9)[-1].wrench
+    world.regrasp(1)
+    world.advance(0.5)
+    after = device(world, "wrist_ft").since(before)
+    assert np.abs(after[0].wrench - drifted)[1] > 0.15, "the zero jumps, farther than noise does"
+    assert {reading.stamp.status for reading in after} == {Status.OK}
