@@ -15,7 +15,7 @@ from mechanics.readings import Array
 
 #: below this normal force a ratio is noise [N]
 LEAST_NORMAL_FORCE = 1.0
-#: how far a tared zero may be off from stroke to stroke [N], 1 sigma, and by which factor that itself is not known, 1 sigma
+#: how far a tared zero may be off from stroke to stroke [N], and by which factor that itself is not known, 1 sigma
 STROKE_ERROR, STROKE_FACTOR = 0.02, 2.0
 #: how far the forces' axes may be turned against the contact's, 1 sigma [rad]
 TURNED = 0.005
