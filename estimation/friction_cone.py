@@ -27,6 +27,8 @@ _PEAK_STEPS = 3
 _SLIPPING, _EVIDENCE = 8.0, 6.0
 #: an atom this wide, over the noise, is no edge
 _WIDEST = 6.0
+#: no force is told to better than this [N], however well a stroke's agree: what is systematic in one is not modelled
+LEAST_WIDTH = 0.002
 #: share of outliers at most: with more, a wrong cone explains anything
 MOST_OUTLIERS = 0.1
 #: parameters of the likelihood without shares: µ, apex (2), log width of the atom
@@ -77,13 +79,17 @@ class Cone:
 
     def _densities(self, p: Array, offset: Array | float = 0.0) -> Array:
         """Densities (..., n, 3) [1/N] of |f_t| from the apex: slipping, sticking, neither; ``offset`` (..., n) [N]."""
-        width = np.exp(p[3]) * self._noise * np.sqrt(1 + p[0] ** 2)
+        width = self._width(p)
         edge = self._slope(p) * np.maximum(self._force[:, 0] - p[1], 0.25 * LEAST_NORMAL_FORCE)
         side = np.abs(self._force[:, 1] - p[2]) - offset
         beyond = (side - edge) / width
         atom = np.exp(-0.5 * beyond**2) / (width * np.sqrt(2 * np.pi))
         within = (ndtr(-beyond) - ndtr(-(side + edge) / width)) / edge
         return np.stack([atom, within, np.full_like(side, 1 / self._span)], axis=-1)
+
+    def _width(self, p: Array) -> float:
+        """1 sigma of a force across the edge [N]."""
+        return float(np.hypot(np.exp(p[3]) * self._noise * np.sqrt(1 + p[0] ** 2), LEAST_WIDTH))
 
     def _slope(self, p: Array) -> Array | float:
         """That of the edge on the side of each sample."""
@@ -239,7 +245,7 @@ class StrokeCone(Cone):
         size = STROKE_ERROR * np.exp(p[PARAMETERS])
         coarse = np.repeat(size * _COARSE[:, None], len(self._begins), axis=1)
         peak = np.take_along_axis(coarse, self._by_offset(p, coarse).argmax(axis=0)[None], axis=0)[0]
-        width = np.exp(p[3]) * self._noise * np.sqrt(1 + p[0] ** 2)
+        width = self._width(p)
         beyond = np.abs(self._force[:, 1] - p[2]) - self._slope(p) * np.maximum(self._force[:, 0] - p[1], 0.0)
         precision = np.full(len(peak), size**-2)
         for _ in range(_PEAK_STEPS):

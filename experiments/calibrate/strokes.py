@@ -135,11 +135,8 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Draggin
     pressed = dragged.poses(stroke.tilt, along, np.full(len(along), stroke.force))
     loading = dragged.poses(stroke.tilt, np.full(10, along[0]), np.linspace(0.0, stroke.force, 10))
     normal = se2.rotate(dragged.X_W_face[2], np.array([0.0, 1.0]))
-    up = np.array([*(CLEARANCE * normal), 0.0])
     mover, seen_by = rig.mover, witnesses(rig)
-    # turned as it will be pressed: the tool, which weighs more than what is sought and is known only as well as the
-    # sensor's gains are, then hangs as it does in the stroke, and the tare takes its weight out
-    above = np.append((loading[0] + up)[:2], pressed[0, 2])
+    above, cleared = clear(dragged, stroke.tilt, along[[0, -1]], pressed[[0, -1], 2])
     rig.lift_to(above[1] + 0.01)
     mover.travel(np.array([above[0], mover.pose[1], above[2]]))
     mover.travel(above)
@@ -155,7 +152,7 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Draggin
         mover.ramp(loading[-1] + deeper, 0.2)
     begin, end = _dragged(rig, pressed + deeper, length / speed)
     moving = [witness.between(begin, end) for witness in seen_by]
-    mover.ramp(pressed[-1] + up, 0.5)
+    mover.ramp(cleared, 0.5)
     rig.rest(0.3)
     after = _Rest.taken(rig, seen_by, 0.4)
     share = (begin + (np.arange(len(moving[0])) + 0.5) * BIN * 1e9 - before.at_ns) / (after.at_ns - before.at_ns)
@@ -170,6 +167,20 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Draggin
     forces = forces[:, np.mean(forces[:, :, 0], axis=0) > TOUCHED]
     angles = np.array([witness.angle(mover.pose) for witness in seen_by]) - dragged.X_W_face[2]
     return Dragging(forces[:, steady(forces[0])], angles)
+
+
+def clear(dragged: Dragged, tilt: float, along: Array, angles: Array) -> Array:
+    """Poses X_W_ee (n, 3) that hold the object free of the face above ``along`` (n,), the end-effector at ``angles``.
+
+    They are those at which it is pressed: the tool, which weighs more than what is sought and is known only as well as
+    the sensor's gains are, then hangs as it does in the stroke, and the tare takes its weight out. An object that is
+    not pressed turns with the end-effector, and no corner of it may get as low as the face for that.
+    """
+    poses = dragged.poses(tilt, along, np.zeros(len(along)))
+    reach = float(np.linalg.norm(dragged.vertices - dragged.grasp[:2], axis=1).max())
+    up = CLEARANCE + reach * np.abs(se2.wrap(angles - poses[:, 2]))
+    normal = se2.rotate(dragged.X_W_face[2], np.array([0.0, 1.0]))
+    return np.column_stack([poses[:, :2] + up[:, None] * normal, angles])
 
 
 def steady(forces: Array) -> NDArray[np.bool_]:

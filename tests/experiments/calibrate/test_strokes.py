@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from estimation.errors import FitError
-from experiments.calibrate.strokes import BIN, SWINGING, Stroke, drawn, steady, stroked
+from experiments.calibrate.strokes import BIN, CLEARANCE, SWINGING, Dragged, Stroke, clear, drawn, steady, stroked
+from mechanics import se2
+from mechanics.catalogue import load_object, load_sensor
 
 NOBODY: Any = None
 
@@ -42,3 +44,17 @@ def test_what_gets_going_in_the_middle_of_a_stroke_is_left_out_and_what_sticks_o
 @pytest.mark.parametrize("bins", [0, 1, 20])
 def test_of_a_stroke_that_slides_all_along_nothing_is_left_out(bins: int) -> None:
     assert steady(np.tile([4.0, 1.3], (bins, 1))).tolist() == [True] * bins
+
+
+@pytest.mark.parametrize("turned", [-0.2, 0.0, 0.2])
+@pytest.mark.parametrize("tilt", [-0.3, 0.3])
+def test_where_a_zero_is_taken_the_object_is_free_of_the_face_however_the_hand_is_turned(tilt, turned) -> None:
+    hbox = load_object("hbox")
+    vertices, stiffness = hbox.polygon.vertices, load_sensor("soft_bubble").stiffness
+    dragged = Dragged(vertices, np.zeros(3), 1e-3, stiffness, np.zeros(3), half=0.1)
+    along = np.array([-0.01, 0.02])
+    angles = tilt + np.array([turned, turned])
+    for pose in clear(dragged, tilt, along, angles):
+        # next to weightless, it hangs in the fingers as it lies in them
+        assert se2.transform(pose, vertices)[:, 1].min() >= CLEARANCE - 1e-4
+        assert pose[2] == tilt + turned
