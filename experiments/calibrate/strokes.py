@@ -54,6 +54,11 @@ class Dragged:
     half: float
     gravity: float = 9.81
 
+    @property
+    def normal(self) -> Array:
+        """The face's outward normal (2,) in W."""
+        return se2.rotate(self.X_W_face[2], np.array([0.0, 1.0]))
+
     def poses(self, tilt: float, along: Array, force: Array) -> Array:
         """X_W_ee (n, 3) that has the object's lowest point at ``along`` (n,) [m] on the face, pressed with ``force``.
 
@@ -63,10 +68,9 @@ class Dragged:
         X_face_go = standing_pose(corner, np.full(len(along), tilt), 0.0)
         X_face_go[:, 0] += along
         X_W_go = se2.compose(self.X_W_face, X_face_go)
-        normal = se2.rotate(self.X_W_face[2], np.array([0.0, 1.0]))
         at_grasp = se2.compose(X_W_go, self.grasp)[:, :2]
         contact = se2.transform(X_W_go, corner) - at_grasp
-        pushed = force[:, None] * normal
+        pushed = force[:, None] * self.normal
         torque = contact[:, 0] * pushed[:, 1] - contact[:, 1] * pushed[:, 0]
         environment = np.column_stack([pushed, torque]) + gravity_wrench(
             np.full(len(along), self.mass), X_W_go[:, :2] - at_grasp, np.full(len(along), self.gravity)
@@ -134,7 +138,7 @@ def stroked(rig: Rig, dragged: Dragged, stroke: Stroke, speed: float) -> Draggin
     along = np.linspace(stroke.begin, stroke.end, max(2, int(length / 0.001)))
     pressed = dragged.poses(stroke.tilt, along, np.full(len(along), stroke.force))
     loading = dragged.poses(stroke.tilt, np.full(10, along[0]), np.linspace(0.0, stroke.force, 10))
-    normal = se2.rotate(dragged.X_W_face[2], np.array([0.0, 1.0]))
+    normal = dragged.normal
     mover, seen_by = rig.mover, witnesses(rig)
     above, cleared = clear(dragged, stroke.tilt, along[[0, -1]], pressed[[0, -1], 2])
     rig.lift_to(above[1] + 0.01)
@@ -179,8 +183,7 @@ def clear(dragged: Dragged, tilt: float, along: Array, angles: Array) -> Array:
     poses = dragged.poses(tilt, along, np.zeros(len(along)))
     reach = float(np.linalg.norm(dragged.vertices - dragged.grasp[:2], axis=1).max())
     up = CLEARANCE + reach * np.abs(se2.wrap(angles - poses[:, 2]))
-    normal = se2.rotate(dragged.X_W_face[2], np.array([0.0, 1.0]))
-    return np.column_stack([poses[:, :2] + up[:, None] * normal, angles])
+    return np.column_stack([poses[:, :2] + up[:, None] * dragged.normal, angles])
 
 
 def steady(forces: Array) -> NDArray[np.bool_]:
