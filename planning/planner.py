@@ -53,12 +53,14 @@ def plan(
     *,
     optimiser: Optimiser | None = None,
     objective: Callable[[Problem], Any] = FusedObjective,
+    start: Callable[[Problem, Any, np.random.Generator], Array] | None = None,
     rng: np.random.Generator | None = None,
     levels: int = RAMP_LEVELS,
     provenance: dict[str, Any] | None = None,
 ) -> Plan:
     """Return the plan called ``name``: the best that ``optimiser`` finds from the nominal trajectory (None: that one).
 
+    ``start`` makes another z (K, 5) to set out from, of the problem, its loss and ``rng``, before the optimiser draws.
     ``objective`` makes the loss of a problem: an `Objective` that can also `evaluate`; ``levels`` ≥ 2 counts a ramp's
     points; ``provenance`` is added to the plan's own. Raises InfeasiblePlan, see `check`. A result that misses cones,
     balance or wish by more than `planning.verification` allows is ``inaccurate``, and its provenance says how.
@@ -70,7 +72,8 @@ def plan(
     loss = objective(problem)
     optimum, queries = None, 1
     if optimiser is not None:
-        optimum = optimiser.optimise(loss, problem.start, np.random.default_rng(0) if rng is None else rng)
+        rng = np.random.default_rng(0) if rng is None else rng
+        optimum = optimiser.optimise(loss, problem.start if start is None else start(problem, loss, rng), rng)
         queries = optimum.queries
     z = problem.start if optimum is None else optimum.z
     found = loss.evaluate(z)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
 from typing import Any
 from zlib import crc32
 
@@ -89,22 +89,21 @@ def make(resolved: Resolved, stage: PlanStage, known: Believed, made_of: SkillTa
 
     Raises InfeasiblePlan and ValueError.
     """
-    from experiments.planning.start import Astray
+    from experiments.planning.start import disturbed
     from planning.planner import plan
 
     asked = task(resolved, stage, known) if made_of is None else made_of
-    optimiser, sigma = stage.make_optimiser(), stage.start.sigma
+    away = partial(disturbed, sigma=stage.start.sigma, beta=stage.start.beta)
     told = stage.model_dump(mode="json", include={"parameters", "backend", "limits", "start"})
-    made = plan(
+    return plan(
         asked,
         stage.name,
-        optimiser=Astray(optimiser, asked.problem, sigma, stage.start.beta) if sigma else optimiser,
+        optimiser=stage.make_optimiser(),
         objective=objective(stage.backend),
+        start=away if stage.start.sigma else None,
         rng=generator(resolved, stage),
         provenance={"experiment": resolved.experiment.name, "seed": resolved.experiment.seed, **told, **provenance()},
     )
-    # the optimiser's own settings, whatever it is wrapped in
-    return replace(made, provenance={**made.provenance, "optimiser": stage.optimiser})
 
 
 def resting_eo(asked: SkillTask) -> tuple[float, float, float] | None:

@@ -11,7 +11,7 @@ import numpy as np
 from mechanics.readings import Array
 from planning import evaluation
 from planning.errors import InfeasiblePlan
-from planning.optimisers.base import Objective, Optimiser, Optimum
+from planning.optimisers.base import Objective
 from planning.optimisers.noise import coloured
 from planning.problem import Problem
 
@@ -44,16 +44,3 @@ def disturbed(
         raise NoStart(0, problem.contacts[0].name, np.nan, np.nan, reason="its programs were not solved")
     reason = found.reason or f"{found.contact} needs µ ≥ {found.need:.3g}, has {found.have:.3g}"
     raise NoStart(found.step, found.contact, found.need, found.have, by=found.by, reason=reason)
-
-
-class Astray(Optimiser):
-    """An optimiser that sets out from `disturbed`, and from there draws on."""
-
-    def __init__(self, optimiser: Optimiser, problem: Problem, sigma: float, beta: float):
-        self.name = optimiser.name  # type: ignore[misc]  # it is that one's result
-        self._optimiser, self._problem, self._sigma, self._beta = optimiser, problem, sigma, beta
-
-    def optimise(self, objective: Objective, z: Array, rng: np.random.Generator) -> Optimum:
-        """Improve a start of its own; ``z`` is not used. Raises NoStart."""
-        start = disturbed(self._problem, objective, rng, self._sigma, self._beta)
-        return self._optimiser.optimise(objective, start, rng)
