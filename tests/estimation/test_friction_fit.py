@@ -131,7 +131,8 @@ def strokes_with_offsets(seed, count=16, n=24, offset=0.03, noise=0.01, turned=0
     forces, number = [], np.repeat(np.arange(count), n)
     co, si = np.cos(turned), np.sin(turned)
     for k in range(count):
-        normal = rng.uniform(*(right if k % 2 else (2.0, 6.0))) + 0.3 * rng.uniform(-1, 1, n)
+        low, high = right if k % 2 else (2.0, 6.0)
+        normal = rng.uniform(low, high) + 0.3 * rng.uniform(-1, 1, n)
         tangential = (1 if k % 2 else -1) * MU * normal
         seen = np.column_stack([co * normal - si * tangential, si * normal + co * tangential])
         forces.append(seen + noise * rng.standard_normal((n, 2)) + offset * rng.standard_normal(2))
