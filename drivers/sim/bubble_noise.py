@@ -53,6 +53,10 @@ class NoiseSource:
             field = self._field(1.0)
             self.blind = field > np.quantile(field, 1 - figures.dropout)
 
+    def begin_trial(self, rng: np.random.Generator) -> None:
+        """What is drawn frame by frame comes from ``rng`` from now on, and is like no frame before."""
+        self._rng, self._last = rng, None
+
     @property
     def noisy(self) -> bool:
         """Whether two pictures of the same differ."""

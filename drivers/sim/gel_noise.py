@@ -31,6 +31,10 @@ class NoisyExposure:
         x, y = np.meshgrid(np.linspace(-1, 1, width, dtype=np.float32), np.linspace(-1, 1, height, dtype=np.float32))
         self._shade = (1 - 0.5 * figures.vignetting * (x * x + y * y))[..., None]
 
+    def begin_trial(self, rng: np.random.Generator) -> None:
+        """What is drawn frame by frame comes from ``rng`` from now on."""
+        self._rng = rng
+
     def constant(self, picture: NDArray[np.float32]) -> NDArray[np.float32]:
         """The picture with what does not change from frame to frame: vignetting and bias."""
         figures = self._figures

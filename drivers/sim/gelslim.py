@@ -123,6 +123,10 @@ class SimGelSlim(Faulty[ImageReading], TactileSensor):
         self._forget()
         self._sequence = 0
 
+    def begin_trial(self, rng: np.random.Generator) -> None:
+        """Noise from ``rng`` from now on, of the same camera."""
+        self._noise().begin_trial(rng)
+
     def _picture(self, view: FingerView | None) -> NDArray[np.float32]:
         assert self._renderer is not None
         if view is None or not view.held:

@@ -156,6 +156,10 @@ class SimSoftBubble(Faulty[ImageReading], TactileSensor):
         self._forget()
         self._sequence = 0
 
+    def begin_trial(self, rng: np.random.Generator) -> None:
+        """Noise from ``rng`` from now on, of the same camera."""
+        self._spoiler().begin_trial(rng)
+
     def _figures(self) -> DepthNoise:
         bubble = self._world.profile.bubble
         return bubble.stereo if self.camera.kind == "stereo" else bubble.time_of_flight

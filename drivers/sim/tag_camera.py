@@ -237,6 +237,10 @@ class SimTagCamera(Faulty[TagReading], TagCamera):
         self._sequence = 0
         self._image = None
 
+    def begin_trial(self, rng: np.random.Generator) -> None:
+        """Noise and losses from ``rng`` from now on, of the same camera."""
+        self._rng = rng
+
     def _equip(self) -> None:
         """The camera that this lab has, by the profile and the epoch's random numbers."""
         self._figures = figures = self._world.profile.camera

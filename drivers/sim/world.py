@@ -223,9 +223,9 @@ class World:
     def regrasp(self, trial: int) -> None:
         """Take the go into the fingers anew, as between trials, and draw what no calibration removes.
 
-        How the go lies in the fingers, what the handling leaves in their membranes, the arm's errors of repeatability
-        and the walk of the force/torque sensors' zeros follow from the seed and ``trial`` (from 0) alone. No time
-        passes; the go hangs at rest. A profile without such errors leaves everything as it is.
+        How the go lies in the fingers, what the handling leaves in their membranes, the arm's errors of repeatability,
+        the walk of the force/torque sensors' zeros and the noise of the pictures follow from the seed and ``trial``
+        (from 0) alone. No time passes; the go hangs at rest. A profile without such errors leaves everything as it is.
         Raises DeviceFault while there is no scene, CommandRefused where the go would touch something.
         """
         plant = self.plant("world", "regrasp")
@@ -234,8 +234,8 @@ class World:
         if self._arm is not None and self.profile.arm.repeatability.si.any():
             self._arm.begin_trial(stream(self.seed, "arm.trial", trial))
         for name, device in self.devices.items():
-            if isinstance(device, SimForceTorque):
-                device.begin_trial(stream(self.seed, name, "trial", trial))
+            if device is not self._arm and (begin_trial := getattr(device, "begin_trial", None)) is not None:
+                begin_trial(stream(self.seed, name, "trial", trial))
         offset, fresh = self.lab.grasp_offset(trial), not plant.membrane.is_linear or min(plant.finger_limit) < inf
         if plant.held and (fresh or offset.any()):
             plant.regrasp(se2.compose(np.array(self.scene.grasp), offset), self.lab.membrane_strain(trial))
