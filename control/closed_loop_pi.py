@@ -36,14 +36,18 @@ class LimitedPI:
         self._limit = np.array([settings.limit_mm * 1e-3, settings.limit_mm * 1e-3, np.radians(settings.limit_deg)])
         self._sum = np.zeros(3)
 
-    def update(self, error: Array) -> Array:
-        """Take ``error`` (3,) in and return what both terms ask for, within the limits."""
+    def update(self, error: Array, least: float = 0.0) -> Array:
+        """Take ``error`` (3,) in and return what both terms ask for, within the limits.
+
+        So much is added to the sum that both terms undo a share of ``least`` of the error, where k_p + k_i is less.
+        """
         k_p, k_i = self.settings.k_p, self.settings.k_i
         if k_i > 0:
-            wanted = k_p * error + k_i * (self._sum + error)
+            added = error * max(1.0, (least - k_p) / k_i)
+            wanted = k_p * error + k_i * (self._sum + added)
             beyond = np.where(np.abs(wanted) > self._limit, wanted - np.copysign(self._limit, wanted), 0.0)
             # back from beyond the limit, but not farther than to where the sum was
-            self._sum = self._sum + error - np.clip(beyond / k_i, np.minimum(error, 0.0), np.maximum(error, 0.0))
+            self._sum = self._sum + added - np.clip(beyond / k_i, np.minimum(added, 0.0), np.maximum(added, 0.0))
         return np.clip(k_p * error + k_i * self._sum, -self._limit, self._limit)
 
 

@@ -19,6 +19,7 @@ from control.settings import TrialSettings
 from drivers.errors import CommandRefused, DriverError, SimulationDiverged
 from drivers.interfaces import Clock
 from estimation.force_torque import FreeAirLoad
+from estimation.tag_pose import TagPose
 from estimation.tool_identification import Agreement
 from mechanics import se2
 from mechanics.readings import Array
@@ -125,6 +126,7 @@ class Trial:
         self._settle()
         if controller.feedback:
             self._converge_in_air(controller, go_air, ee_air)
+        self._zero(self._observer.see(("go",))["go"] if self._observer.tags.get("go") else None, go_air)
 
         self._watch.phase("preload", 0.0)
         touch = controller.command(plan.preload_go[0], plan.preload_ee[0])
@@ -251,8 +253,15 @@ class Trial:
             raise _Ended("stopped", f"the start could not be verified: {problem}")
         table, go, eo = (seen.get(body) for body in ("table", "go", "eo"))
         assert table is not None  # _start_problem saw it
-        self._observer.zero(self._load, go_expected if go is None else go.pose)
+        self._zero(go, go_expected)
         return anchored(self._nominal, table.pose, None if eo is None else eo.pose)
+
+    def _zero(self, seen: TagPose | None, go_expected: Array) -> None:
+        """Zero the force sensors in free air, under the weight of a go where its tag was seen, else where it should be.
+
+        Once for what is estimated in air, and again just before touch-down: a sensor's zero walks meanwhile.
+        """
+        self._observer.zero(self._load, go_expected if seen is None else seen.pose)
 
     def _start_problem(self, seen: dict, go_expected: Array) -> str | None:
         for body, pose in seen.items():

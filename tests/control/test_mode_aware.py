@@ -131,10 +131,30 @@ def test_an_extrinsic_object_out_of_view_drops_out(plan):
 
 
 def test_a_law_with_gains_of_its_own_may_have_the_paper_s_form(plan):
-    # with a proportional gain as well, the first update is (k_p + k_i) of the step that k = 1 would take
-    state = PlanarState(plan.ee[0], plan.go[0], None, np.array([0.0, -3.0, 0.0]))
-    one, part = ModeAware(plan, ModeAwareSettings(k_p=0, k_i=1)), ModeAware(plan, ModeAwareSettings(k_p=0.2, k_i=0.3))
-    one.in_contact(0, state)
-    part.in_contact(0, state)
+    # after the first updates, a proportional gain adds k_p of the newest error to k_i of each
+    good = PlanarState(plan.ee[0], plan.go[0], None, plan.wrench[0])
+    off = replace(good, wrench=np.array([0.0, -3.0, 0.0]))
+    one, part = ModeAware(plan), ModeAware(plan, ModeAwareSettings(k_p=0.2, k_i=0.3))
+    one.in_contact(0, off)
+    for _ in range(9):
+        part.in_contact(0, good)
+    part.in_contact(0, off)
     assert part.correction == pytest.approx(0.5 * one.correction)
     assert isinstance(part.settings, PISettings)
+
+
+def test_the_nth_update_undoes_an_nth_of_its_error_at_least(plan):
+    # 1 N too little, by the same reading again and again: k_i = 0.3 takes over from 1/n at the fourth
+    law, seen = ModeAware(plan), []
+    for _ in range(6):
+        law.in_contact(0, PlanarState(plan.ee[0], plan.go[0], None, np.array([0.0, -3.0, 0.0])))
+        seen.append(law.correction)
+    shares = np.linalg.norm(np.diff([np.zeros(3), *seen], axis=0), axis=1)
+    assert shares / shares[0] == pytest.approx([1, 1 / 2, 1 / 3, 0.3, 0.3, 0.3])
+
+
+def test_the_first_update_undoes_what_the_free_air_could_not_show(plan):
+    # the pose is felt 0.2 mm off where the contact blocks, which nothing but the force tells
+    before, after = settle(ModeAware(plan), OnCorner(plan.stiffness, felt=[0.0, 0.0002, 0.0]), updates=1)
+    assert np.abs(before.wrench - plan.wrench[0])[1] > 0.15
+    assert after.wrench == pytest.approx(plan.wrench[0], abs=0.02)
