@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import json
-import logging
-import os
-import select
-import signal
 import socket
-import subprocess
-import sys
-import threading
-from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self, cast
+from typing import cast
 from urllib.parse import urlsplit
 
 from drivers.config import StationConfig
 from drivers.errors import DriverError, NotConnected
+from drivers.hosting import HostProcess, StationHost
 from drivers.interfaces import Arm, Device, ForceTorqueSensor, Gripper, TactileSensor, TagCamera
 from drivers.wire import topics
 from drivers.wire.bus import Bus
@@ -30,21 +23,17 @@ from drivers.wire.link import Link
 from drivers.wire.log import LogWriter
 from drivers.wire.watch import Watch
 
-HOST_START = 20.0
-"""How long a simulated host may take to start [s]; it takes about one."""
+Hosting = Callable[[StationConfig], StationHost]
+"""What makes the host of a simulated station."""
 
-_HERE = str(Path(__file__).resolve().parent.parent)
 _PROBE = 1.0
-_HOST_STOP = 10.0
 _PROTOCOL = 1
-
-log = logging.getLogger(__name__)
 
 
 class Devices(Mapping[str, Device]):
     """The open devices of a station by name; also by role, where the station has exactly one of a kind.
 
-    ``simulation`` is None for a station without a world, ``host`` unless this process started it.
+    ``simulation`` is None for a station without a world, ``host`` unless this connection started it.
     """
 
     def __init__(
@@ -54,7 +43,7 @@ class Devices(Mapping[str, Device]):
         devices: dict[str, RemoteSensor],
         clock: RemoteClock,
         simulation: RemoteSimulation | None,
-        host: HostProcess | None,
+        host: StationHost | None,
         link: Link,
         watch: Watch,
     ):
@@ -135,17 +124,22 @@ class Station:
     def __init__(self, config: StationConfig):
         self.config = config
 
-    def connect(self) -> Connection:
-        """The way in: ``with Station(config).connect() as devices:``."""
-        return Connection(self.config)
+    def connect(self, host: Hosting = HostProcess) -> Connection:
+        """The way in: ``with Station(config).connect() as devices:``.
+
+        ``host`` serves a simulated station that does not run yet: in a process of its own, or in a thread of this one
+        (`drivers.sim.host_thread.HostThread`).
+        """
+        return Connection(self.config, host)
 
 
 class Connection:
-    """An open station: host process if it had to be started, bus, devices; closed in the reverse order."""
+    """An open station: its host if it had to be started, bus, devices; closed in the reverse order."""
 
-    def __init__(self, config: StationConfig):
+    def __init__(self, config: StationConfig, host: Hosting = HostProcess):
         self.config = config
-        self.host: HostProcess | None = None
+        self.host: StationHost | None = None
+        self._made_by = host
         self._stack = ExitStack()
 
     def __enter__(self) -> Devices:
@@ -170,8 +164,12 @@ class Connection:
                     "nothing listens there",
                     "Start the station with `extrinsic serve STATION`, or correct bus.endpoint",
                 )
-            self.host = stack.enter_context(HostProcess(config))
-        bus = stack.enter_context(Bus(endpoint, timeout=config.bus.timeout, shared_memory=False, lease=config.lease))
+            self.host = stack.enter_context(self._made_by(config))
+        bus = None if self.host is None else self.host.bus
+        if bus is None:
+            bus = stack.enter_context(
+                Bus(endpoint, timeout=config.bus.timeout, shared_memory=False, lease=config.lease)
+            )
         watch = bus.watch(topics.alive(config.name, topics.WORLD))
         stack.callback(self._abandon, watch)
         if not watch.seen(config.bus.timeout):
@@ -210,115 +208,6 @@ class Connection:
         """Kill a host that no longer answers, before the bus waits for it to close in order."""
         if watch.gone and self.host is not None:
             self.host.kill()
-
-
-class HostProcess:
-    """The simulated station as a child process; started by `__enter__`, ended and reaped by `close`.
-
-    It is in a process group of its own, so that an interrupt from the keyboard reaches only this process, which then
-    closes in order. It ends by itself when this process dies.
-    """
-
-    def __init__(self, config: StationConfig):
-        self._process: subprocess.Popen[bytes] | None = None
-        self._config = config
-        self._said: deque[str] = deque(maxlen=50)
-        self._listener: threading.Thread | None = None
-
-    @property
-    def pid(self) -> int:
-        """The process id. Raises NotConnected when it is not running."""
-        if self._process is None:
-            raise NotConnected(self._config.name, "name its host's process", "there is none", "")
-        return self._process.pid
-
-    def __enter__(self) -> Self:
-        order = {
-            "config": self._config.model_dump(mode="json"),
-            # the kernel's signal follows the *thread* that starts the host; one that may end first must not set it
-            "bound": threading.current_thread() is threading.main_thread(),
-        }
-        self._process = process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "drivers.sim.host"],  # -P: a folder that happens to lie here is no package
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (_HERE, os.environ.get("PYTHONPATH"))))},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        )
-        try:
-            assert process.stdin is not None and process.stdout is not None and process.stderr is not None
-            self._listener = threading.Thread(target=self._hear, args=(process.stderr,), name="host", daemon=True)
-            self._listener.start()
-            try:
-                process.stdin.write(json.dumps(order).encode() + b"\n")
-                process.stdin.flush()
-            except OSError:
-                pass  # it ended at once; its last words tell why
-            self._await(process.stdout)
-        except BaseException:
-            self.close()
-            raise
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def _await(self, stdout: IO[bytes]) -> None:
-        asked, remedy = "start its simulated host", "Run `extrinsic serve STATION` to see what it says"
-        if not select.select([stdout], [], [], HOST_START)[0]:
-            raise NotConnected(self._config.name, asked, f"not ready within {HOST_START:g} s", remedy)
-        line = stdout.readline()
-        try:
-            said = json.loads(line)
-        except ValueError:
-            said = {"error": "it ended before it was ready. " + self.last_words()}
-        if "ready" not in said:
-            child = NotConnected(
-                said.get("device", "host"), said.get("asked", "serve"), said.get("error", "?"), said.get("remedy", "")
-            )
-            raise NotConnected(self._config.name, asked, "it failed", remedy, children=(child,))
-
-    def kill(self) -> None:
-        """End it at once."""
-        if self._process is not None:
-            self._process.kill()
-
-    def last_words(self) -> str:
-        """The newest lines that the host wrote to its standard error."""
-        if self._listener is not None and self._process is not None and self._process.poll() is not None:
-            self._listener.join(timeout=1.0)
-        return "\n".join(self._said)
-
-    def _hear(self, stderr: IO[bytes]) -> None:
-        for line in stderr:
-            text = line.decode(errors="replace").rstrip()
-            self._said.append(text)
-            log.warning("host: %s", text)
-
-    def close(self) -> None:
-        """Ask the host to end, insist, and reap it; idempotent."""
-        process, self._process = self._process, None
-        if process is None:
-            return
-        if process.poll() is None:
-            process.send_signal(signal.SIGTERM)
-            try:
-                process.wait(_HOST_STOP)
-            except subprocess.TimeoutExpired:
-                log.warning("the simulated host did not end within %g s and was killed", _HOST_STOP)
-                process.kill()
-                process.wait()
-        if self._listener is not None:
-            self._listener.join(timeout=1.0)
-        for pipe in (process.stdin, process.stdout, process.stderr):
-            if pipe is not None:
-                try:
-                    pipe.close()
-                except OSError:
-                    continue  # the other end is gone
 
 
 def listening(endpoint: str) -> bool:

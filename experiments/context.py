@@ -12,7 +12,8 @@ from typing import Any
 
 from control.observe import Finger
 from control.settings import TrialSettings
-from drivers.station import Devices, Station
+from drivers.hosting import HostProcess
+from drivers.station import Devices, Hosting, Station
 from drivers.wire.log import LogWriter
 from experiments import setup
 from experiments.calibrate import store
@@ -32,7 +33,7 @@ Record = EventRecord | PhaseRecord | TrialRecord | WaypointRecord
 
 
 class RunContext:
-    """One run. `closing` holds what has to be closed in order, however the run ends."""
+    """One run. ``closing`` holds what has to be closed in order, however it ends; ``host`` as `runner.run` has it."""
 
     def __init__(
         self,
@@ -45,6 +46,7 @@ class RunContext:
         closing: ExitStack,
         ask: Callable[[str], bool],
         check_interrupt: Callable[[], None],
+        host: Hosting = HostProcess,
     ):
         self.resolved = resolved
         self.folder, self.results, self.log, self.progress = folder, results, log, progress
@@ -55,7 +57,7 @@ class RunContext:
         self.calibrations = calibrations
         self.holder = f"run-{socket.gethostname()}-{os.getpid()}"
         self.ask, self.check_interrupt = ask, check_interrupt
-        self._closing = closing
+        self._closing, self._host = closing, host
         self._devices: Devices | None = None
         self._fingers: tuple[Finger, ...] | None = None
 
@@ -63,7 +65,7 @@ class RunContext:
         """The station's devices, opened and logged at the first call; a simulated world is reset to the scene."""
         if self._devices is None:
             with self.progress.step("open the station"):
-                devices = self._closing.enter_context(Station(self.resolved.station).connect())
+                devices = self._closing.enter_context(Station(self.resolved.station).connect(self._host))
                 devices.attach(self.log)
                 if devices.simulation is not None:
                     world = self.resolved.station.world

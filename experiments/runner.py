@@ -15,6 +15,8 @@ from typing import Any
 from rich.console import Console
 
 from drivers.errors import CommandRefused, DriverError
+from drivers.hosting import HostProcess
+from drivers.station import Hosting
 from drivers.wire.log import LogWriter
 from estimation.errors import FitError
 from experiments.calibrate import store
@@ -44,8 +46,13 @@ class Outcome:
     reason: str = ""
 
 
-def run(resolved: Resolved, out: Path | None = None, console: Console | None = None) -> Outcome:
-    """Run an experiment. Raises InputError before anything was started; every later end is in the outcome."""
+def run(
+    resolved: Resolved, out: Path | None = None, console: Console | None = None, host: Hosting = HostProcess
+) -> Outcome:
+    """Run an experiment. Raises InputError before anything was started; every later end is in the outcome.
+
+    ``host`` serves a simulated station that does not run yet. A process of its own keeps its crash from this one.
+    """
     console = console or Console(stderr=True)
     _keep_what_is_here()
     calibrations = store.load(resolved)
@@ -71,7 +78,7 @@ def run(resolved: Resolved, out: Path | None = None, console: Console | None = N
     }
     with Interrupt() as interrupt:
         try:
-            code, reason = _stages(resolved, calibrations, folder, results, console, interrupt)
+            code, reason = _stages(resolved, calibrations, folder, results, console, interrupt, host)
         except KeyboardInterrupt:
             code, reason = ExitCode.INTERRUPTED, INTERRUPTED
         interrupt.closing()
@@ -95,6 +102,7 @@ def _stages(
     results: dict[str, Any],
     console: Console,
     interrupt: Interrupt,
+    host: Hosting,
 ) -> tuple[ExitCode, str]:
     """Run all stages with log and station open, close both in order, and say how it ended."""
     progress = Progress(console)
@@ -103,7 +111,7 @@ def _stages(
         log = closing.enter_context(LogWriter(folder.log, flush=resolved.station.log.flush))
         log.add_attachment("experiment.yaml", "application/yaml", folder.experiment.read_bytes())
         ask, heed = _ask(console), interrupt.check
-        context = RunContext(resolved, calibrations, folder, results, log, progress, closing, ask, heed)
+        context = RunContext(resolved, calibrations, folder, results, log, progress, closing, ask, heed, host)
         context.save()
         try:
             for done, stage in enumerate(resolved.experiment.stages, 1):
@@ -127,9 +135,17 @@ def _stages(
         interrupt.closing()
         if code in (ExitCode.INFEASIBLE, ExitCode.INTERRUPTED, ExitCode.DEVICE_FAILED):
             context.event("error", reason)
+        if code is ExitCode.DEVICE_FAILED and (said := _last_words(context)):
+            context.event("error", f"the simulated host said: {said}")
         results["health"] = _health(context)
         results["log"] = _accounts(context, log)
     return code, reason
+
+
+def _last_words(context: RunContext) -> str:
+    """What the host that this run started has said, to the end of it."""
+    host = None if context.opened is None else context.opened.host
+    return "" if host is None else host.last_words()
 
 
 def _health(context: RunContext) -> dict[str, Any] | None:

@@ -1,7 +1,7 @@
-"""The process that owns the simulated world and serves its devices on the bus.
+"""Owns the simulated world and serves its devices on the bus, mostly as a process of its own.
 
-The main thread owns the world. Handlers of the bus only put work into its inbox; in lockstep the world advances when
-it is asked to, in real time it is paced by absolute deadlines with work done between the steps.
+One thread owns the world: there the main thread. Handlers of the bus only put work into its inbox; in lockstep the
+world advances when it is asked to, in real time it is paced by absolute deadlines with work done between the steps.
 
 As a process of its own it reads one line of JSON from standard input (``{"config": …, "orphan": bool}``), answers with
 one line (``{"ready": pid}`` or ``{"error": …}``) and ends when standard input does, at SIGTERM or SIGINT: arm held,
@@ -84,10 +84,18 @@ class Inbox:
             work()
 
 
-class Host:
-    """The world on a bus. `run` blocks in the calling thread, which owns the world, until `stop`."""
+def _die() -> None:
+    """End this process as a crash does: no farewell to anybody."""
+    os.kill(os.getpid(), signal.SIGKILL)
 
-    def __init__(self, config: StationConfig, bus: Bus):
+
+class Host:
+    """The world on a bus. `run` blocks in the calling thread, which owns the world, until `stop`.
+
+    ``crash`` is what a fault of this name does to it.
+    """
+
+    def __init__(self, config: StationConfig, bus: Bus, crash: Callable[[], None] = _die):
         self.config, self.bus = config, bus
         self.world = World(config)
         self.inbox = Inbox()
@@ -108,7 +116,7 @@ class Host:
         self._truths = self._next_truth_ns = 0
         self._servers: dict[str, DeviceServer] = {}
         self._due: dict[str, float] = {}  # when a camera takes its next frame in real time [s]
-        self.world.faults.on_crash = _die
+        self.world.faults.on_crash = crash
 
     def _now_ns(self) -> int:
         return self.world.now_ns() + self.skipped_ns
@@ -118,8 +126,13 @@ class Host:
         self._stopping = True
         self.inbox.wake()
 
-    def run(self, ready: Callable[[], None] = lambda: None) -> None:
-        """Serve until `stop`; ``ready`` is called once every device is on the bus."""
+    def run(
+        self, ready: Callable[[], None] = lambda: None, failed: Callable[[BaseException], None] = lambda _: None
+    ) -> None:
+        """Serve until `stop`; ``ready`` is called once every device is on the bus.
+
+        What ends it otherwise is raised, and given to ``failed`` before the devices vanish from the bus.
+        """
         with ExitStack() as stack:
             stack.callback(self._withdraw)
             self._attend()
@@ -142,9 +155,13 @@ class Host:
             stack.callback(self.desk.serve(topics.WORLD, "describe", self._describe, direct=True))
             stack.callback(self.bus.token(topics.alive(self.config.name, topics.WORLD)))
             ready()
-            while not self._stopping:
-                wait = _IDLE if self.world.lockstep or not self._staged else self._pace()
-                self.inbox.serve(wait)
+            try:
+                while not self._stopping:
+                    wait = _IDLE if self.world.lockstep or not self._staged else self._pace()
+                    self.inbox.serve(wait)
+            except BaseException as error:
+                failed(error)
+                raise
 
     def _attend(self) -> None:
         """Serve the devices that are there, and no others: a device that has gone takes its server with it."""
@@ -282,11 +299,6 @@ class Host:
 
     def _truth(self, _: bytes) -> Answer:
         return Answer(type=messages.TRUTH, data=encode_reading(self.world.truth(), self.skipped_ns))
-
-
-def _die() -> None:
-    """End this process as a crash does: no farewell to anybody."""
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def serve(config: StationConfig, ready: Callable[[Host], None] = lambda _: None) -> int:

@@ -13,7 +13,7 @@ import time
 import weakref
 from collections.abc import Callable
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal, Self, cast
 
 import zenoh
 
@@ -49,11 +49,22 @@ class Query:
             self._query.drop()
 
 
+class _AtOnce:
+    """A session whose subscribers are called by the thread that publishes, without one of their own between."""
+
+    def __init__(self, session: zenoh.Session):
+        self._session = session
+
+    def declare_subscriber(self, topic: str, handler: Callable[[zenoh.Sample], None]) -> zenoh.Subscriber:
+        return self._session.declare_subscriber(topic, zenoh.handlers.Callback(handler, indirect=False))
+
+
 class Bus:
     """A zenoh session as a context manager. ``endpoint`` is listened at (``listen``) or connected to.
 
     ``mode``: ``peer`` on one machine, ``client`` toward a router. ``lease`` [s] is how long a peer may be silent, or
-    not take what it is sent, before it counts as dead; zenoh's own ten seconds are too many beside an arm. Raises
+    not take what it is sent, before it counts as dead; zenoh's own ten seconds are too many beside an arm. ``at_once``
+    is for a session that both ends of a stream share: who publishes delivers, too, in its own thread. Raises
     NotConnected when the session cannot be opened within ``timeout`` seconds.
     """
 
@@ -66,8 +77,10 @@ class Bus:
         timeout: float = 5.0,
         shared_memory: bool = True,
         lease: float = 1.0,
+        at_once: bool = False,
     ):
         self.endpoint, self.timeout = endpoint, timeout
+        self._at_once = at_once
         self._subscriptions: dict[str, Subscription] = {}
         self._queriers: dict[str, zenoh.Querier] = {}
         self._tokens: set[zenoh.LivelinessToken] = set()
@@ -130,7 +143,8 @@ class Bus:
         with self._lock:
             found = self._subscriptions.get(topic)
             if found is None:
-                found = self._subscriptions[topic] = Subscription(self.session, topic, self.unsubscribe)
+                session = cast("zenoh.Session", _AtOnce(self.session)) if self._at_once else self.session
+                found = self._subscriptions[topic] = Subscription(session, topic, self.unsubscribe)
             return found
 
     def unsubscribe(self, subscription: Subscription) -> None:

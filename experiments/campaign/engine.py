@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from uuid import uuid4
 
 import dask.config
@@ -29,7 +29,7 @@ from mechanics.yaml_input import InputError, Problem
 #: how long a scheduler may take to answer, and to have a worker [s]
 PATIENCE = 10.0
 #: how long a local cluster may take to start on a busy machine [s]
-_START = "120s"
+_START = 120.0
 _LOCAL: dict[str, Any] = {
     "processes": True,
     "threads_per_worker": 1,
@@ -56,8 +56,9 @@ def run_jobs(
     On ``workers`` processes of this machine, or on those of the Dask ``scheduler`` (``tcp://host:port``), which have to
     see ``folder`` under the same path. A job whose worker dies or whose devices fail is run again, ``retries`` times.
 
-    Raises InputError and InfeasiblePlan before anything is started, NotConnected when the scheduler goes, and
-    KeyboardInterrupt; a campaign that was cut off goes on when it is started again.
+    Raises InputError and InfeasiblePlan before anything of a job is written or run, while workers may be starting;
+    NotConnected when the scheduler goes or no worker comes; and KeyboardInterrupt. A campaign that was cut off goes on
+    when it is started again.
     """
     console = console or Console(stderr=True)
     if not jobs:
@@ -65,11 +66,12 @@ def run_jobs(
     campaign, resolved = CampaignFolder(folder), resolve(jobs)
     asked = campaign.agree(jobs, resolved)
     missing = [job for job in jobs if campaign.job(job.id).ended() is None]
-    examine(missing, resolved)
     if missing:
         with Interrupt() as interrupt, _client(scheduler, min(workers, len(missing)), retries) as client:
             try:
+                examine(missing, resolved)  # while the workers start and import
                 campaign.keep(asked, jobs, resolved)
+                _await_worker(client)
                 with progress(console, len(jobs), len(jobs) - len(missing)) as tell:
                     _run(client, missing, campaign, retries, tell)
             finally:
@@ -136,18 +138,31 @@ def _client(scheduler: str | None, workers: int, retries: int) -> Iterator[Clien
         "distributed.scheduler.allowed-failures": retries,
         "distributed.scheduler.worker-saturation": 1.0,  # a worker that dies takes no job with it but the one it runs
         "distributed.worker.multiprocessing-method": "spawn",
-        "distributed.comm.timeouts.connect": _START,
+        "distributed.comm.timeouts.connect": f"{_START:g}s",
         "distributed.nanny.preload": [],
         "distributed.worker.preload": [],
+        # nobody looks at what Dask tells of itself, and a job has to wait for each look
+        "distributed.worker.profile.enabled": False,
+        "distributed.admin.tick.interval": "1s",
     }
     with (
         tempfile.TemporaryDirectory(prefix="extrinsic-sweep-", ignore_cleanup_errors=True) as scratch,
         dask.config.set({**settings, "temporary-directory": scratch}),
-        LocalCluster(**_LOCAL, n_workers=workers, local_directory=scratch) as cluster,
+        LocalCluster(**_LOCAL, n_workers=0, local_directory=scratch) as cluster,
         Client(cluster, timeout=_START, set_as_default=False) as client,
     ):
         client.register_plugin(Unattended())
+        cast("Any", cluster).scale(workers)  # does not wait for them
         yield client
+
+
+def _await_worker(client: Client) -> None:
+    """Wait for the first worker. Raises NotConnected."""
+    try:
+        client.wait_for_workers(1, timeout=_START)
+    except TimeoutError:
+        asked, got = "start its workers", f"none came within {_START:g} s"
+        raise NotConnected("this machine", asked, got, "Ask for fewer `--workers`, or free some memory") from None
 
 
 @contextmanager

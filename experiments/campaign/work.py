@@ -1,6 +1,7 @@
 """What a worker does with a job. All that passes through the scheduler is the name of the job's folder.
 
-A worker imports and compiles at its first job and keeps it for the others.
+A worker imports and compiles at its first job and keeps it for the others. It hosts its simulated station itself, in a
+thread: a process for each job would begin with the imports of the simulation.
 """
 
 from __future__ import annotations
@@ -8,8 +9,9 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import sys
 import threading
-from contextlib import chdir
+from contextlib import chdir, suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,6 +20,7 @@ from typing import TYPE_CHECKING
 from distributed import Worker, WorkerPlugin
 
 if TYPE_CHECKING:
+    from drivers.station import Hosting
     from experiments.files import Resolved
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -31,7 +34,10 @@ class JobFailed(Exception):
 
 
 class Unattended(WorkerPlugin):
-    """A worker that leaves Ctrl-C to the process that started it, which closes its workers in order."""
+    """A worker that leaves Ctrl-C to the process that started it, which closes its workers in order.
+
+    It imports what jobs need while it waits for the first.
+    """
 
     name = "extrinsic-unattended"
     idempotent = True
@@ -40,6 +46,7 @@ class Unattended(WorkerPlugin):
         """Ignore SIGINT, where this is a process of its own."""
         if threading.current_thread() is threading.main_thread() and worker.nanny is not None:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
+            threading.Thread(target=_prepare_alone, name="prepare", daemon=True).start()
 
 
 def work(job: str, here: str) -> str:
@@ -56,23 +63,32 @@ def work(job: str, here: str) -> str:
         return _run(path)
 
 
+def _prepare_alone() -> None:
+    with _ALONE, suppress(Exception):  # the first job meets it again, and says so
+        _prepare()
+
+
 @cache
 def _prepare() -> None:
-    """One thread for each library, here and in the simulated hosts, before any of them is imported."""
+    """One thread for each library, those that a job will import among them; and what every job needs."""
     os.environ.update(dict.fromkeys(THREADS, "1"))
     from experiments import kernels
 
     kernels.keep()
-    import torch
     from threadpoolctl import threadpool_limits
 
+    from drivers.sim import tag_camera, world  # noqa: F401
+    from experiments import runner  # noqa: F401
+
     threadpool_limits(limits=1)
-    torch.set_num_threads(1)
+    if (torch := sys.modules.get("torch")) is not None:  # imported later, it goes by the environment
+        torch.set_num_threads(1)
 
 
 def _run(path: Path) -> str:
     from rich.console import Console
 
+    from drivers.sim import host_thread
     from experiments import runner
     from experiments.campaign.folder import JobFolder
     from experiments.exit_codes import ExitCode
@@ -83,10 +99,22 @@ def _run(path: Path) -> str:
         return ended[0].name
     run = folder.next_run()
     with run.with_name(f"{run.name}.log").open("w", encoding="utf-8") as said:
-        outcome = runner.run(_on_its_own(load(str(folder.experiment))), run, Console(file=said, width=120))
+        resolved = _on_its_own(load(str(folder.experiment)))
+        outcome = runner.run(resolved, run, Console(file=said, width=120), _host(resolved))
+    if host_thread.stuck():  # it takes the processor from whatever runs here next; a new worker does not
+        os.kill(os.getpid(), signal.SIGKILL)
     if outcome.exit_code in (ExitCode.DEVICE_FAILED, ExitCode.INTERRUPTED):
         raise JobFailed(outcome.reason)
     return run.name
+
+
+def _host(resolved: Resolved) -> Hosting:
+    """Where a simulated station runs: here, or in a process of its own, if it has to keep the pace of the wall."""
+    from drivers.hosting import HostProcess
+    from drivers.sim.host_thread import HostThread
+
+    world = resolved.station.world
+    return HostThread if world is not None and world.clock == "lockstep" else HostProcess
 
 
 def _on_its_own(resolved: Resolved) -> Resolved:

@@ -32,6 +32,25 @@ def test_what_is_published_arrives_whole_and_in_order(served: Bus, joined: Bus) 
     assert publisher.count == subscription.count == 2000
 
 
+def test_a_session_that_both_ends_share_delivers_before_the_publisher_goes_on(endpoint: str) -> None:
+    with (
+        Bus(endpoint, listen=True, shared_memory=False, at_once=True) as bus,
+        Bus(endpoint, shared_memory=False) as far,
+    ):
+        publisher, subscription = bus.publisher("lab/ft/wrench", messages.WRENCH), bus.subscribe("lab/ft/wrench")
+        elsewhere = far.subscribe("lab/ft/wrench")
+        got: list[tuple[int, int]] = []
+        subscription.listen(lambda sample: got.append((sample.sequence, threading.get_ident())))
+        bus.serve("lab/ft/tare", lambda query: query.reply(b"done"))
+        far.request("lab/ft/tare", b"", device="ft", asked="tare")  # the subscription has arrived with this
+        for i in range(300):
+            publisher.put(b"x" * 80, i, i)
+            assert got[-1] == (i, threading.get_ident())
+        assert len(got) == subscription.count == 300
+        publisher.put(b"x", 300, 300)
+        assert elsewhere.wait(300, None, time.monotonic() + 5)  # who joined from outside hears it as ever
+
+
 def test_what_is_published_together_leaves_at_the_end_whole_and_in_order(desk: Desk, joined: Bus) -> None:
     publisher = desk.publisher("ft", "wrench", messages.WRENCH)
     beside = desk.bus.publisher("lab/arm/pose", messages.POSE)

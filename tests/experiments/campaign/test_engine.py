@@ -1,17 +1,29 @@
 """Jobs on a scheduler that is there already: retries, failures, restarts; and clean ends, for warnings are errors."""
 
 import json
+import os
+import signal
 from typing import Any
 
 import pytest
 from distributed import LocalCluster
 
+from drivers.hosting import HostProcess
+from drivers.sim import host_thread
+from drivers.sim.host_thread import HostThread
 from experiments.campaign import engine
 from experiments.campaign.engine import run_jobs
 from experiments.campaign.folder import CampaignFolder
+from experiments.campaign.frame import trials_frame
 from experiments.campaign.jobs import Job, resolve
+from experiments.campaign.work import _host as host_of
+from experiments.campaign.work import work
+from experiments.files import load
 from mechanics.yaml_input import InputError
+from planning.errors import InfeasiblePlan
 
+TRIAL = ("stages.0.parameters.steps=2", "stages.1.controllers=[open_loop]")
+LEAN = "stages.0.parameters.tangential=[1, 1]"
 PLAN_ONLY = "stages=[{stage: plan, name: press, skill: grasped_static, parameters: {steps: 2}}]"
 
 
@@ -55,6 +67,58 @@ def test_a_job_that_fails_is_tried_again_and_takes_no_other_down(folder):
         assert bad.run.name == "run.2"
         assert json.loads((bad.run / "results.json").read_text())["plans"]
         assert campaign.job("bad").failure is None
+
+
+def test_a_simulated_crash_fails_its_job_with_its_reason_and_takes_no_other_down(folder):
+    """Station and run share the worker's process, which has to live on."""
+    crash = "world.faults=[{kind: crash, after: 2}]"
+    wanted = [
+        Job("before", "grasped_static", None, TRIAL, {"crash": False}),
+        Job("crash", "grasped_static", None, (*TRIAL, crash), {"crash": True}),
+        Job("after", "grasped_static", None, (*TRIAL, "seed=1"), {"crash": False}),
+    ]
+    with cluster(1) as there:
+        before, crashed, after = run_jobs(wanted, folder, scheduler=there.scheduler_address, retries=1)
+    assert [(job.status, job.attempts) for job in (before, after)] == [("completed", 1)] * 2
+    assert (crashed.status, crashed.attempts) == ("failed", 2)
+    assert "the device's server has died" in crashed.reason
+    assert crashed.run is not None
+    assert "the simulated world has crashed" in crashed.run.with_name(f"{crashed.run.name}.log").read_text()
+    rows = trials_frame(folder).set_index("job")
+    assert rows["status"].to_dict() == {"before": "completed", "crash": "device_failed", "after": "completed"}
+    assert "the device's server has died" in rows["reason"]["crash"]
+
+
+@pytest.mark.parametrize(("clock", "host"), [("lockstep", HostThread), ("realtime", HostProcess)])
+def test_a_worker_hosts_what_need_not_keep_the_pace_of_the_wall(clock, host):
+    assert host_of(load("grasped_static", None, [f"world.clock={clock}"])) is host
+
+
+def test_no_job_has_been_looked_into_when_one_cannot_be(folder):
+    """The workers may be there already: the folder says that nothing was given to them."""
+    impossible = Job("no", "grasped_static", None, ("friction.go-ground=0.1", LEAN), {})
+    with cluster(1) as there:
+        with pytest.raises(InfeasiblePlan, match="needs µ"):
+            run_jobs([*jobs("a"), impossible], folder, scheduler=there.scheduler_address)
+        assert not there.scheduler.tasks
+    assert not folder.exists()
+
+
+def test_a_worker_whose_station_hangs_ends_once_its_results_are_written(folder, monkeypatch):
+    class Ended(Exception):
+        pass
+
+    def kill(pid, number):
+        raise Ended(pid, number)
+
+    [job] = jobs("hangs")
+    campaign = prepared(folder, [job])
+    monkeypatch.setattr(host_thread, "stuck", lambda: True)
+    monkeypatch.setattr(os, "kill", kill)
+    with pytest.raises(Ended) as ended:
+        work(str(campaign.job("hangs").path), str(folder.parent))
+    assert ended.value.args == (os.getpid(), signal.SIGKILL)
+    assert campaign.job("hangs").ended() is not None
 
 
 def test_a_scheduler_that_does_not_answer_is_refused_before_anything_is_written(folder, monkeypatch):

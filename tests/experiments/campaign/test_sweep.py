@@ -15,6 +15,8 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from drivers.station import listening
+from drivers.wire.log_reader import LogReader
 from experiments import runner
 from experiments.calibrate import store
 from experiments.calibrate.models import ElasticityCalibration
@@ -164,10 +166,13 @@ def story(shared_command):
         first.wait_for("open_loop")
         here = psutil.Process(sweep.pid)
         worker = first.writer(here.children())
-        hosts = worker.children()
+        told["beside it"] = worker.children(recursive=True)
+        ports = [place.laddr.port for place in worker.net_connections("tcp") if place.status == psutil.CONN_LISTEN]
         worker.send_signal(signal.SIGKILL)
         first.wait_for_end()
-        told["hosts"], told["survivors"] = hosts, psutil.wait_procs(hosts, timeout=60)[1]
+        worker.wait(60)
+        told["stations"] = ports
+        told["listening"] = [port for port in ports if listening(f"tcp/127.0.0.1:{port}")]
 
     for line in iter(sweep.stderr.readline, ""):
         told.setdefault("said", []).append(line)
@@ -190,10 +195,11 @@ def story(shared_command):
     return folder, jobs, told
 
 
-def test_a_killed_worker_loses_nothing_and_its_host_goes_with_it(story):
+def test_a_killed_worker_loses_nothing_and_its_station_goes_with_it(story):
     _, jobs, told = story
-    assert told["hosts"]
-    assert not told["survivors"]
+    assert not told["beside it"]  # a worker hosts its station itself
+    assert told["stations"]
+    assert not told["listening"]
     assert jobs[0].id in told["ended"]
     assert told["first runs"][:2] == ["run", "run.1"]
     assert "completed, at attempt " in told["said"][-1]
@@ -235,6 +241,18 @@ def test_the_figures_are_those_of_runs_one_by_one(story, tmp_path, monkeypatch):
         swept = CampaignFolder(folder).job(job.id).ended()
         assert swept is not None
         assert outcome.results["trials"] == swept[1]["trials"]
+        assert outcome.results["log"] == swept[1]["log"]
+        assert said(outcome.folder.path) == said(swept[0])
+
+
+def said(run):
+    """What the station said in a run and where the trial's waypoints were, by topic, as bytes."""
+    found = {}
+    for message in LogReader(run / "log.mcap").messages():
+        if message.topic not in ("run/trial", "sim/arm/target"):  # the time of planning, the name of the commander
+            found.setdefault(message.topic, []).append((message.sequence, message.log_ns, message.payload))
+    assert sum(len(messages) for messages in found.values()) > 1000
+    return found
 
 
 def test_nothing_is_run_again_and_another_sweep_is_refused(story, monkeypatch):

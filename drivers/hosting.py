@@ -1,0 +1,174 @@
+"""The host of a simulated station as whoever starts it sees it, and the usual one: a child process."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Protocol, Self
+
+from drivers.config import StationConfig
+from drivers.errors import NotConnected
+from drivers.wire.bus import Bus
+
+HOST_START = 20.0
+"""How long a simulated host may take to start [s]; it takes about one."""
+
+HOST_STOP = 10.0
+"""How long a host that was asked to end may take [s]."""
+
+_HERE = str(Path(__file__).resolve().parent.parent)
+
+log = logging.getLogger(__name__)
+
+
+class StationHost(Protocol):
+    """A simulated station that serves while it is entered, whatever it runs in."""
+
+    @property
+    def pid(self) -> int:
+        """The id of the process that it runs in. Raises NotConnected when it does not run."""
+        ...
+
+    @property
+    def bus(self) -> Bus | None:
+        """The session that it serves on, where that is in this process."""
+        ...
+
+    def __enter__(self) -> Self:
+        """Serve; raises NotConnected, with the host's own failure as a child."""
+        ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def kill(self) -> None:
+        """End it at once, as far as that is possible; it answers no more."""
+        ...
+
+    def last_words(self) -> str:
+        """What it said last, its failure among it."""
+        ...
+
+
+class HostProcess:
+    """The simulated station as a child process; started by `__enter__`, ended and reaped by `close`.
+
+    It is in a process group of its own, so that an interrupt from the keyboard reaches only this process, which then
+    closes in order. It ends by itself when this process dies.
+    """
+
+    def __init__(self, config: StationConfig):
+        self._process: subprocess.Popen[bytes] | None = None
+        self._config = config
+        self._said: deque[str] = deque(maxlen=50)
+        self._listener: threading.Thread | None = None
+
+    @property
+    def pid(self) -> int:
+        """The process id. Raises NotConnected when it is not running."""
+        if self._process is None:
+            raise NotConnected(self._config.name, "name its host's process", "there is none", "")
+        return self._process.pid
+
+    @property
+    def bus(self) -> None:
+        """None: its session is in its process."""
+        return None
+
+    def __enter__(self) -> Self:
+        order = {
+            "config": self._config.model_dump(mode="json"),
+            # the kernel's signal follows the *thread* that starts the host; one that may end first must not set it
+            "bound": threading.current_thread() is threading.main_thread(),
+        }
+        self._process = process = subprocess.Popen(
+            [sys.executable, "-P", "-m", "drivers.sim.host"],  # -P: a folder that happens to lie here is no package
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (_HERE, os.environ.get("PYTHONPATH"))))},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,
+        )
+        try:
+            assert process.stdin is not None and process.stdout is not None and process.stderr is not None
+            self._listener = threading.Thread(target=self._hear, args=(process.stderr,), name="host", daemon=True)
+            self._listener.start()
+            try:
+                process.stdin.write(json.dumps(order).encode() + b"\n")
+                process.stdin.flush()
+            except OSError:
+                pass  # it ended at once; its last words tell why
+            self._await(process.stdout)
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _await(self, stdout: IO[bytes]) -> None:
+        asked, remedy = "start its simulated host", "Run `extrinsic serve STATION` to see what it says"
+        if not select.select([stdout], [], [], HOST_START)[0]:
+            raise NotConnected(self._config.name, asked, f"not ready within {HOST_START:g} s", remedy)
+        line = stdout.readline()
+        try:
+            said = json.loads(line)
+        except ValueError:
+            said = {"error": "it ended before it was ready. " + self.last_words()}
+        if "ready" not in said:
+            child = NotConnected(
+                said.get("device", "host"), said.get("asked", "serve"), said.get("error", "?"), said.get("remedy", "")
+            )
+            raise NotConnected(self._config.name, asked, "it failed", remedy, children=(child,))
+
+    def kill(self) -> None:
+        """End it at once."""
+        if self._process is not None:
+            self._process.kill()
+
+    def last_words(self) -> str:
+        """The newest lines that the host wrote to its standard error."""
+        if self._listener is not None and self._process is not None and self._process.poll() is not None:
+            self._listener.join(timeout=1.0)
+        return "\n".join(self._said)
+
+    def _hear(self, stderr: IO[bytes]) -> None:
+        for line in stderr:
+            text = line.decode(errors="replace").rstrip()
+            self._said.append(text)
+            log.warning("host: %s", text)
+
+    def close(self) -> None:
+        """Ask the host to end, insist, and reap it; idempotent."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(HOST_STOP)
+            except subprocess.TimeoutExpired:
+                log.warning("the simulated host did not end within %g s and was killed", HOST_STOP)
+                process.kill()
+                process.wait()
+        if self._listener is not None:
+            self._listener.join(timeout=1.0)
+        for pipe in (process.stdin, process.stdout, process.stderr):
+            if pipe is not None:
+                try:
+                    pipe.close()
+                except OSError:
+                    continue  # the other end is gone
