@@ -20,7 +20,8 @@ COLUMNS = {"go_pose_mm": "pose [mm]", "eo_pose_mm": "eo pose [mm]", "wrench_N": 
 def error_table(results: dict[str, Any]) -> Table:
     """Pose and wrench error of every trial, through the sensors and, in simulation, against the truth beside it."""
     title = f"{results['experiment']} on {results['station']}, seed {results['seed']}"
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    # narrow: a terminal of 80 columns has room for the names of trials
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, show_edge=False, padding=0)
     table.add_column("trial", overflow="fold")
     table.add_column("status", no_wrap=True)
     table.add_column("seen by", no_wrap=True)
@@ -36,6 +37,7 @@ def error_table(results: dict[str, Any]) -> Table:
     if not results["trials"]:
         table.add_row("no trial was run", results["status"])
     paper = beside(results["trials"])["rows"]
+    several = len({skill for skill, _ in groups}) > 1
     for (skill, controller), group in groups.items():
         printed = paper.get(group[0]["name"])
         if printed is not None and not set(printed) & set(figures):  # the paper has components alone
@@ -45,7 +47,8 @@ def error_table(results: dict[str, Any]) -> Table:
         table.add_section()
         if len(group) > 1:
             completed = sum(trial["status"] == "completed" for trial in group)
-            _rows(table, f"{skill}, {controller}", f"{completed} of {len(group)}", group, "bold", figures)
+            name = f"{skill}, {controller}" if several else controller
+            _rows(table, name, f"{completed} of {len(group)}", group, "bold", figures)
         if printed is not None:
             name = controller if len(group) == 1 else ""
             table.add_row(name, "", "paper", *(_cell(printed.get(key)) for key in figures), style="dim")
@@ -73,7 +76,7 @@ def _over(figures: list[dict[str, float] | None]) -> dict[str, float] | None:
 
 
 def _cell(figure: dict[str, float] | None) -> str:
-    return "–" if figure is None else f"{figure['mean']:.3f} ± {figure['std']:.3f}"
+    return "–" if figure is None else f"{figure['mean']:.2f} ± {figure['std']:.2f}"
 
 
 def status_table(rows: Sequence[DeviceStatus]) -> Table:

@@ -41,21 +41,28 @@ def test_the_paper_stands_beside_what_it_measured_and_nothing_else():
 def test_units_and_figures_are_whole_at_80_columns():
     text = shown([trial("open_loop")])
     assert "pose [mm]" in text and "wrench [N]" in text
-    assert "2.000 ± 0.100" in text and "1.860 ± 0.230" in text
+    assert "2.00 ± 0.10" in text and "1.86 ± 0.23" in text
+
+
+def test_the_name_of_a_trial_is_whole_at_80_columns_beside_every_figure():
+    figures = {key: {"mean": 2.0, "std": 0.1} for key in ("go_pose_mm", "eo_pose_mm", "wrench_N")}
+    seen = {"measured": figures, "truth": figures, "extrinsic_object": "hbox", "status": "lost_contact"}
+    text = shown([trial("closed_loop_pi", skill="extrinsic_pushing") | seen | {"name": "tip-closed_loop_pi-0"}])
+    assert "tip-closed_loop_pi-0 lost_contact measured 2.00 ± 0.10" in text
 
 
 def test_several_trials_end_with_the_mean_of_their_means_and_its_spread():
     text = shown([trial("open_loop", 0, 1.0), trial("open_loop", 1, 3.0)])
     assert "2 of 2" in text
-    assert "2.000 ± 1.000" in text
+    assert "2.00 ± 1.00" in text
 
 
 def test_an_extrinsic_object_has_a_column_where_there_is_one():
     assert "eo pose" not in shown([trial("open_loop")])
     row = trial("open_loop", skill="extrinsic_pushing") | {"extrinsic_object": "hbox"}
     figures = {key: {"mean": 2.0, "std": 0.1} for key in ("go_pose_mm", "wrench_N")}
-    text = shown([row | {"measured": figures | {"eo_pose_mm": {"mean": 0.125, "std": 0.25}}, "truth": None}])
-    assert "eo pose [mm]" in text and "0.125 ± 0.250" in text and "2.000 ± 0.100" in text
+    text = shown([row | {"measured": figures | {"eo_pose_mm": {"mean": 0.126, "std": 0.25}}, "truth": None}])
+    assert "eo pose [mm]" in text and "0.13 ± 0.25" in text and "2.00 ± 0.10" in text
 
 
 def test_a_run_without_trials_says_so():
