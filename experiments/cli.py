@@ -87,7 +87,7 @@ def run(
     resolved = load(experiment, station, sets or [])
     outcome = runner.run(resolved, out, Console(stderr=True))
     console = Console()
-    console.print(error_table(outcome.results))
+    console.print("", error_table(outcome.results), "", sep="\n")
     if outcome.exit_code is not ExitCode.DONE:
         Console(stderr=True, soft_wrap=True).print(f"[red]{outcome.results['status']}[/]: {outcome.reason}")
     console.print(f"report: {outcome.folder.report}", soft_wrap=True, highlight=False)

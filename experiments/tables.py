@@ -19,7 +19,7 @@ COLUMNS = {"go_pose_mm": "pose [mm]", "eo_pose_mm": "eo pose [mm]", "wrench_N": 
 
 def error_table(results: dict[str, Any]) -> Table:
     """Pose and wrench error of every trial, through the sensors and, in simulation, against the truth beside it."""
-    title = f"{results['experiment']} on {results['station']}, seed {results['seed']}"
+    title = f"{results['experiment']} on {results['station']}, seed {results['seed']}\n"
     # narrow: a terminal of 80 columns has room for the names of trials
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, show_edge=False, padding=0)
     table.add_column("trial", overflow="fold")

@@ -28,6 +28,7 @@ from experiments.calibrate.models import (
     fingerprint,
     friction_name,
 )
+from experiments.calibrate.schema import FrictionStage
 from experiments.files import Resolved, laid_out
 from experiments.provenance import revision
 from experiments.run_folder import write_atomic
@@ -166,7 +167,8 @@ def read(file: Path) -> Calibration:
 def load(resolved: Resolved) -> Calibrations:
     """The calibrations that the experiment may use, by its `calibration` key; a folder that it fills may be missing.
 
-    Raises InputError that names each file which is of another station, device or object, or too old.
+    Raises InputError that names each file which is of another station, device or object, or too old. One that a stage
+    of the experiment makes anew is left out instead: to calibrate again is what the refusal asks for.
     """
     found = Calibrations()
     use = resolved.experiment.calibration
@@ -180,13 +182,16 @@ def load(resolved: Resolved) -> Calibrations:
             expected = "auto, none, or a folder of calibration files"
             raise InputError([resolved.experiment_document.problem(("calibration", "source"), wrong, expected)])
         return found
-    problems: list[Problem] = []
+    problems, remade = list[Problem](), _remade(resolved)
     for name in _wanted(resolved):
         file = folder / f"{name}.yaml"
         if not file.is_file():
             continue
         calibration = read(file)
-        problems += _problems(resolved, calibration, file)
+        refused = _problems(resolved, calibration, file)
+        if refused and name in remade:
+            continue
+        problems += refused
         found.add(calibration, file)
     if problems:
         raise InputError(problems)
@@ -204,6 +209,24 @@ def _wanted(resolved: Resolved) -> list[str]:
         "camera",
         "clock",
     ]
+
+
+def _remade(resolved: Resolved) -> set[str]:
+    """The names of the files that this experiment's own stages write."""
+    held, objects = resolved.grasped.name, prints(resolved)
+    written = {
+        "calibrate_force_torque": ["force_torque"],
+        "calibrate_camera": ["camera", f"tag-{held}"],
+        "calibrate_clock": ["clock"],
+        "calibrate_elasticity": [f"elasticity-{resolved.sensor.name}-{held}"],
+    }
+    names: set[str] = set()
+    for stage in resolved.experiment.stages:
+        if isinstance(stage, FrictionStage):
+            names.add(friction_name(stage.pair, objects))
+        else:
+            names.update(written.get(stage.stage, ()))
+    return names
 
 
 def _problems(resolved: Resolved, calibration: Calibration, file: Path) -> list[Problem]:

@@ -153,6 +153,21 @@ def test_a_file_of_another_serial_station_world_or_age_is_refused_by_name() -> N
     assert store.load(older).elasticity(older) is not None
 
 
+def test_what_an_experiment_calibrates_anew_may_be_as_old_and_as_foreign_as_it_likes() -> None:
+    """To calibrate again is what a refusal asks for."""
+    again = "stages=[{stage: calibrate_elasticity}]"
+    of = resolved("calibration.source=given")
+    old = changed(elasticity(of), made=datetime.now(UTC) - timedelta(days=400), devices={"wrist_ft": "ATI-7"})
+    file = store.save(Path("given"), old)
+    assert list(store.load(resolved("calibration.source=given", again))) == []
+    with pytest.raises(InputError, match="400 days old"):  # what it does not make is refused as ever
+        store.load(resolved("calibration.source=given", "stages=[{stage: calibrate_force_torque}]"))
+    store.save(Path("given"), elasticity(of))
+    assert len(list(Path("given").iterdir())) == 2, "the old one lies beside it"
+    known = store.load(resolved("calibration.source=given", again))
+    assert known.files["elasticity-soft_bubble-tall_box"] == file, "one that is in order is known meanwhile"
+
+
 def test_a_file_of_an_object_of_the_same_name_and_another_shape_is_refused() -> None:
     of = resolved("calibration.source=given")
     made = changed(elasticity(of), objects={"go": "tall_box 00000000"})
