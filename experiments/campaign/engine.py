@@ -22,7 +22,7 @@ from drivers.errors import NotConnected
 from experiments.campaign.folder import CampaignFolder
 from experiments.campaign.jobs import FAILED, Job, JobOutcome, examine, resolve
 from experiments.campaign.progress import Tell, progress
-from experiments.campaign.work import JobFailed, Unattended, work
+from experiments.campaign.work import JobFailed, Unattended, Unsampled, work
 from experiments.interrupt import Interrupt
 from mechanics.yaml_input import InputError, Problem
 
@@ -141,7 +141,7 @@ def _client(scheduler: str | None, workers: int, retries: int) -> Iterator[Clien
         "distributed.comm.timeouts.connect": f"{_START:g}s",
         "distributed.nanny.preload": [],
         "distributed.worker.preload": [],
-        # nobody looks at what Dask tells of itself, and a job has to wait for each look
+        # nobody looks at what Dask tells of itself, a job has to wait for each look, and see `Unsampled`
         "distributed.worker.profile.enabled": False,
         "distributed.admin.tick.interval": "1s",
     }
@@ -185,4 +185,5 @@ def _remote(scheduler: str) -> Iterator[Client]:
         except TimeoutError:
             remedy = f"start one where extrinsic is installed: dask worker {scheduler} --nthreads 1"
             raise refused(f"it has no worker after {PATIENCE:g} s", remedy) from None
+        client.register_plugin(Unsampled())
         yield client

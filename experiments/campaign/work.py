@@ -49,6 +49,23 @@ class Unattended(WorkerPlugin):
             threading.Thread(target=_prepare_alone, name="prepare", daemon=True).start()
 
 
+class Unsampled(WorkerPlugin):
+    """A worker whose threads nobody samples, whoever started it.
+
+    CPython 3.11 lists its threads with a lock held. A garbage collection in the midst of that may give the interpreter
+    away (Dask looks at collections, too), and who starts a thread then waits for the lock, for ever: all stand still.
+    """
+
+    name = "extrinsic-unsampled"
+    idempotent = True
+
+    def setup(self, worker: Worker) -> None:
+        """Stop Dask's profiler."""
+        for name in ("profile", "profile-cycle"):
+            if (callback := worker.periodic_callbacks.pop(name, None)) is not None:
+                callback.stop()
+
+
 def work(job: str, here: str) -> str:
     """Run the job in the folder ``job`` into a new run folder, with ``here`` as the current folder; the run's name.
 

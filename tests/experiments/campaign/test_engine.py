@@ -157,3 +157,12 @@ def test_a_folder_with_anything_else_in_it_is_refused(folder):
 def test_two_jobs_of_one_id_are_refused(folder):
     with pytest.raises(InputError, match="two jobs"):
         run_jobs(jobs("a", "a"), folder)
+
+
+def test_nobody_samples_the_threads_of_a_worker_that_runs_jobs(folder):
+    """In CPython 3.11 that may stop the whole process for ever."""
+    with cluster(1) as there:
+        (worker,) = there.workers.values()
+        assert "profile" in worker.periodic_callbacks
+        run_jobs(jobs("good"), folder, scheduler=there.scheduler_address)
+        assert not {"profile", "profile-cycle"} & set(worker.periodic_callbacks)
