@@ -126,7 +126,7 @@ class Trial:
         self._settle()
         if controller.feedback:
             self._converge_in_air(controller, go_air, ee_air)
-        self._zero(self._observer.see(("go",))["go"] if self._observer.tags.get("go") else None, go_air)
+        self._zero(self._observer.see(("go",))["go"], go_air)
 
         self._watch.phase("preload", 0.0)
         touch = controller.command(plan.preload_go[0], plan.preload_ee[0])

@@ -10,10 +10,11 @@ import signal
 import subprocess
 import sys
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Protocol, Self
+from typing import IO, Self
 
 from drivers.config import StationConfig
 from drivers.errors import NotConnected
@@ -30,37 +31,42 @@ _HERE = str(Path(__file__).resolve().parent.parent)
 log = logging.getLogger(__name__)
 
 
-class StationHost(Protocol):
+class StationHost(ABC):
     """A simulated station that serves while it is entered, whatever it runs in."""
 
     @property
+    @abstractmethod
     def pid(self) -> int:
         """The id of the process that it runs in. Raises NotConnected when it does not run."""
-        ...
 
     @property
+    @abstractmethod
     def bus(self) -> Bus | None:
         """The session that it serves on, where that is in this process."""
-        ...
 
+    @abstractmethod
     def __enter__(self) -> Self:
         """Serve; raises NotConnected, with the host's own failure as a child."""
-        ...
 
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None: ...
+    ) -> None:
+        self.close()
 
+    @abstractmethod
     def kill(self) -> None:
         """End it at once, as far as that is possible; it answers no more."""
-        ...
 
+    @abstractmethod
     def last_words(self) -> str:
         """What it said last, its failure among it."""
-        ...
+
+    @abstractmethod
+    def close(self) -> None:
+        """Ask it to end, and see that it does; idempotent."""
 
 
-class HostProcess:
+class HostProcess(StationHost):
     """The simulated station as a child process; started by `__enter__`, ended and reaped by `close`.
 
     It is in a process group of its own, so that an interrupt from the keyboard reaches only this process, which then
@@ -113,11 +119,6 @@ class HostProcess:
             self.close()
             raise
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _await(self, stdout: IO[bytes]) -> None:
         asked, remedy = "start its simulated host", "Run `extrinsic serve STATION` to see what it says"

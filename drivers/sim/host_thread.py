@@ -10,7 +10,6 @@ import logging
 import os
 import threading
 import traceback
-from types import TracebackType
 from typing import Self
 
 from drivers import hosting
@@ -38,7 +37,7 @@ def _crash() -> None:
     raise Crash("the simulated world has crashed")
 
 
-class HostThread:
+class HostThread(hosting.StationHost):
     """The simulated station in a thread of this process; started by `__enter__`, ended and joined by `close`.
 
     It listens at the station's endpoint as ever; who is in this process shares its session, and hears what it publishes
@@ -93,11 +92,6 @@ class HostThread:
             self.close()
             raise
         return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _serve(self, bus: Bus) -> None:
         try:

@@ -13,7 +13,7 @@ import time
 import weakref
 from collections.abc import Callable
 from types import TracebackType
-from typing import Literal, Self, cast
+from typing import Literal, Self
 
 import zenoh
 
@@ -47,16 +47,6 @@ class Query:
             pass
         finally:
             self._query.drop()
-
-
-class _AtOnce:
-    """A session whose subscribers are called by the thread that publishes, without one of their own between."""
-
-    def __init__(self, session: zenoh.Session):
-        self._session = session
-
-    def declare_subscriber(self, topic: str, handler: Callable[[zenoh.Sample], None]) -> zenoh.Subscriber:
-        return self._session.declare_subscriber(topic, zenoh.handlers.Callback(handler, indirect=False))
 
 
 class Bus:
@@ -143,8 +133,8 @@ class Bus:
         with self._lock:
             found = self._subscriptions.get(topic)
             if found is None:
-                session = cast("zenoh.Session", _AtOnce(self.session)) if self._at_once else self.session
-                found = self._subscriptions[topic] = Subscription(session, topic, self.unsubscribe)
+                found = Subscription(self.session, topic, self.unsubscribe, at_once=self._at_once)
+                self._subscriptions[topic] = found
             return found
 
     def unsubscribe(self, subscription: Subscription) -> None:

@@ -111,15 +111,20 @@ class Subscription:
     """A stream from the bus, delivered to any number of listeners within this process.
 
     ``newest`` is the sequence number of the newest sample that every listener has been given, −1 before the first.
-    Samples without our attachment are counted in ``foreign`` and not delivered.
+    Samples without our attachment are counted in ``foreign`` and not delivered. With ``at_once`` the thread that
+    publishes within this process delivers, too, without one of the subscription's own between.
     """
 
-    def __init__(self, session: zenoh.Session, topic: str, idle: Callable[[Subscription], None]):
+    def __init__(
+        self, session: zenoh.Session, topic: str, idle: Callable[[Subscription], None], *, at_once: bool = False
+    ):
         self.topic, self._idle = topic, idle
         self.count, self.newest, self.foreign = 0, -1, 0
         self._handlers: tuple[Handler, ...] = ()
         self._arrived = threading.Condition()
-        self._subscriber = session.declare_subscriber(topic, self._receive)
+        self._subscriber = session.declare_subscriber(
+            topic, zenoh.handlers.Callback(self._receive, indirect=not at_once)
+        )
 
     def listen(self, handler: Handler) -> Callable[[], None]:
         """Give every sample to ``handler`` too; returns the way to stop."""
