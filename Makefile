@@ -3,10 +3,11 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+GUIDED ?= 600
 export OMP_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup browser demo test test-slow check format clean
+.PHONY: help setup browser demo test test-slow fuzz check format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -40,6 +41,12 @@ test: setup browser  ## the default test suite
 
 test-slow: setup browser  ## the long tests
 	@$(BIN)/python -m pytest -m slow --timeout=1800
+
+fuzz: setup  ## 100 000 cases per decoder, then the CDR and YAML paths by coverage (GUIDED seconds each)
+	@EXTRINSIC_FUZZ_CASES=100000 $(BIN)/python -m pytest tests/fuzz --timeout=0
+	@$(BIN)/python -m pip install --quiet -e '.[fuzz]'
+	@for decoder in reading record message yaml model experiment; do \
+	  $(BIN)/python -m tests.fuzz.coverage_guided $$decoder -max_total_time=$(GUIDED) || exit 1; done
 
 check: setup  ## lint, types and the layers
 	@$(BIN)/ruff check .

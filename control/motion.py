@@ -10,6 +10,9 @@ from drivers.interfaces import Arm, ArmTarget, Clock
 from mechanics import se2
 from mechanics.readings import Array
 
+#: the greatest speed of a minimum-jerk motion over its mean
+PEAK = 15 / 8
+
 
 def quintic(s: float) -> tuple[float, float]:
     """Position and slope of the minimum-jerk ramp from 0 to 1 at ``s`` in [0, 1]: 10 s³ − 15 s⁴ + 6 s⁵."""
@@ -27,13 +30,14 @@ class Mover:
         start: Array,
         speed: float,
         tick: Callable[[], None] = lambda: None,
+        pace: float = 1.0,
     ):
         """``start`` (3,) is the present pose of the end-effector, ``speed`` [m/s] the mean speed of free motions.
 
-        ``tick`` is called after each set-point.
+        ``tick`` is called after each set-point. ``pace`` slows every motion down: 0.2 is a fifth of its speed.
         """
         self.pose = np.asarray(start, float)
-        self.speed = speed
+        self.speed, self.pace = speed, pace
         self._arm, self._clock, self._period = arm, clock, 1.0 / rate
         self._sequence = 0
         self._tick = tick
@@ -45,12 +49,16 @@ class Mover:
         self._clock.sleep(self._period)
         self._tick()
 
+    def _ticks(self, seconds: float) -> int:
+        """Set-points of a motion that is meant to take ``seconds``."""
+        return max(1, round(seconds / self.pace / self._period))
+
     def ramp(self, goal: Array, seconds: float) -> None:
         """Move to ``goal`` (3,) along a straight line in (x, y, θ) with a quintic time law, taking ``seconds``."""
         start = self.pose
         step = np.asarray(goal, float) - start
         step[2] = se2.wrap(step[2])
-        ticks = max(1, round(seconds / self._period))
+        ticks = self._ticks(seconds)
         for i in range(1, ticks + 1):
             s, slope = quintic(i / ticks)
             self._send(start + s * step, slope * step / (ticks * self._period))
@@ -62,7 +70,7 @@ class Mover:
         """
         points = np.concatenate([self.pose[None], np.asarray(path, float)])
         points[:, 2] = np.unwrap(points[:, 2])
-        ticks = max(1, round(seconds / self._period))
+        ticks = self._ticks(seconds)
         for i in range(1, ticks + 1):
             s, slope = quintic(i / ticks)
             at = s * (len(points) - 1)
@@ -77,9 +85,23 @@ class Mover:
         seconds = max(0.2, float(np.hypot(step[0], step[1])) / self.speed, abs(float(se2.wrap(step[2]))) / np.pi * 3)
         self.ramp(goal, seconds)
 
+    def go_above(self, goal: Array) -> None:
+        """Travel to ``goal`` (3,) in free air: up, then across, then down, so that nothing is swept off the table."""
+        here = self.pose
+        height = max(here[1], goal[1])
+        for pose in ([here[0], height, here[2]], [goal[0], height, goal[2]], goal):
+            if np.abs(np.asarray(pose) - self.pose).max() > 1e-6:
+                self.travel(np.asarray(pose, float))
+
     def follow(self, pose: Array, twist: Array) -> None:
-        """One set-point of a path that the caller makes up: ``pose`` (3,) and ``twist`` (3,), one period from now."""
-        self._send(np.asarray(pose, float), np.asarray(twist, float))
+        """One set-point of a path that the caller makes up: ``pose`` (3,) and ``twist`` (3,), one period from now.
+
+        At a slower pace it is several, along a straight line.
+        """
+        start, goal, ticks = self.pose, np.asarray(pose, float), self._ticks(self._period)
+        for i in range(1, ticks):
+            self._send(start + i / ticks * (goal - start), np.asarray(twist, float) / ticks)
+        self._send(goal, np.asarray(twist, float) / ticks)
 
     def rest(self, seconds: float) -> None:
         """Stay for ``seconds``, repeating the set-point so that no watchdog mistakes a pause for a dead commander."""

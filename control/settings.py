@@ -14,6 +14,7 @@ class TrialSettings(BaseModel):
 
     control_rate: float = Field(default=50.0, ge=10, le=1000, description="set-points sent to the arm [Hz]")
     ramp: float = Field(default=0.2, gt=0, le=10, description="duration of the quintic ramp between waypoints [s]")
+    speed: float = Field(default=1.0, ge=0.01, le=1, description="share of its speed at which every motion runs")
     settle: float = Field(default=0.1, ge=0, le=10, description="shortest hold at a waypoint [s]")
     settle_timeout: float = Field(default=2.0, gt=0, le=60, description="longest wait for the wrench to rest [s]")
     settle_force: float = Field(default=0.01, gt=0, description="change of the mean from window to window [N]")
@@ -44,5 +45,8 @@ class TrialSettings(BaseModel):
     on_deviation: Literal["end", "record"] = Field(
         default="end",
         description="what a slip or a lost contact does: it ends the trial, or is recorded and the trial goes on",
+    )
+    rehearsal_force: float = Field(
+        default=3.0, gt=0, description="force on the grasped object that ends a rehearsal, where it touches nothing [N]"
     )
     force_limit: float = Field(default=30.0, gt=0, description="measured force that ends the trial [N]")

@@ -50,6 +50,8 @@ class Watch:
     waypoint: Callable[[WaypointRecord], None] = lambda _waypoint: None
     phase: Callable[[str, float], None] = lambda _name, _fraction: None
     event: Callable[[str, str], None] = lambda _level, _text: None
+    #: what the fingers tell, each time they are asked
+    estimate: Callable[[PlanarState], None] = lambda _state: None
     #: once per set-point; whatever it raises ends the trial
     tick: Callable[[], None] = lambda: None
     #: asks a person to reset the scene and says whether they did; a station without a person answers False
@@ -82,7 +84,13 @@ class Trial:
         self._result = TrialResult("completed", "", plan)
         self._slip_told = self._witness_told = False
         self._mover = Mover(
-            observer.arm, clock, settings.control_rate, observer.arm_pose(), settings.approach_speed, watch.tick
+            observer.arm,
+            clock,
+            settings.control_rate,
+            observer.arm_pose(),
+            settings.approach_speed,
+            watch.tick,
+            settings.speed,
         )
 
     def run(self) -> TrialResult:
@@ -113,7 +121,7 @@ class Trial:
         s, mover = self._settings, self._mover
         self._watch.phase("approach", 0.0)
         go_air = self._lifted(self._nominal)
-        self._go_above(self._nominal.free_air_ee(go_air))
+        mover.go_above(self._nominal.free_air_ee(go_air))
         self._settle()
         plan = self._anchored(go_air)
         self._result.plan = plan
@@ -173,11 +181,11 @@ class Trial:
         updates = s.corrections if controller.feedback else 0
         later = slips(plan)
         for _ in range(0 if later else updates):
-            controller.in_contact(k, self._observer.estimate())
+            controller.in_contact(k, self._estimate())
             self._tell_slip()
             mover.ramp(controller.waypoint(k), s.ramp)
             self._settle()
-        estimated = self._observer.estimate() if self._observer.fingers else None
+        estimated = self._estimate() if self._observer.fingers else None
         measured = self._observer.measure()
         if later and updates:
             controller.in_contact(k, measured if estimated is None else estimated)
@@ -219,6 +227,11 @@ class Trial:
                 f"than their errors allow: check both sensors, and what touches the table besides the objects",
             )
 
+    def _estimate(self) -> PlanarState:
+        state = self._observer.estimate()
+        self._watch.estimate(state)
+        return state
+
     def _tell_slip(self) -> None:
         if self._observer.slip and not self._slip_told:
             self._slip_told = True
@@ -227,7 +240,7 @@ class Trial:
     def _converge_in_air(self, controller: Controller, go: Array, ee: Array) -> None:
         for _ in range(self._settings.air_corrections):
             before = controller.correction
-            controller.in_air(go, self._observer.estimate())
+            controller.in_air(go, self._estimate())
             self._mover.travel(controller.command(go, ee))
             self._settle()
             if np.hypot(*(controller.correction - before)[:2]) < 2e-5:
@@ -292,14 +305,6 @@ class Trial:
     def _lifted(self, plan: Plan) -> Array:
         """X_W_go (3,) a clearance off what the go touches first."""
         return plan.preload_go[0] + self._settings.clearance_mm * 1e-3 * np.append(retreat(plan), 0.0)
-
-    def _go_above(self, goal: Array) -> None:
-        """Travel to ``goal`` in free air: first up, then across, then down, so that nothing is swept off the table."""
-        here = self._mover.pose
-        height = max(here[1], goal[1])
-        for pose in ([here[0], height, here[2]], [goal[0], height, goal[2]], goal):
-            if np.abs(np.asarray(pose) - self._mover.pose).max() > 1e-6:
-                self._mover.travel(np.asarray(pose, float))
 
     def _settle(self) -> None:
         """Hold until the mean wrench of two windows in a row agrees, or the time-out, which is reported."""

@@ -29,10 +29,41 @@ class WorldConfig(Strict):
     faults: tuple[Fault, ...] = Field(default=(), description="what goes wrong, counted from each reset")
 
 
+class TlsConfig(Strict):
+    """Where a station's keys lie: a lab's ``folder`` (`extrinsic lab init`), or three PEM files from elsewhere.
+
+    Paths are relative to the current folder; ``~`` is the home folder.
+    """
+
+    folder: str | None = Field(default=None, min_length=1)
+    ca: str | None = Field(default=None, min_length=1)
+    certificate: str | None = Field(default=None, min_length=1)
+    key: str | None = Field(default=None, min_length=1)
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        files = {"ca": self.ca, "certificate": self.certificate, "key": self.key}
+        given = [name for name, path in files.items() if path is not None]
+        if (self.folder is not None and given) or (self.folder is None and len(given) != len(files)):
+            raise Refusal("names no complete set of keys", "folder alone, or ca, certificate and key")
+        return self
+
+
+def _usual_mode(given: dict[str, Any]) -> Literal["peer", "client"]:
+    return "client" if str(given.get("endpoint", "")).startswith("tls/") else "peer"
+
+
 class BusConfig(Strict):
-    """Where the station's processes meet."""
+    """Where the station's processes meet.
+
+    ``mode`` is ``peer`` on one machine, where the server of the devices listens at ``endpoint``, and ``client`` where a
+    router does (the default with ``tls``). ``insecure`` lets a peer listen where other machines can reach it.
+    """
 
     endpoint: str = Field(default="tcp/127.0.0.1:7447", pattern=r"^(tcp|tls)/.+:\d+$")
+    mode: Literal["peer", "client"] = Field(default_factory=_usual_mode)
+    tls: TlsConfig | None = None
+    insecure: bool = Field(default=False, description="whoever reaches the endpoint may command the arm")
     timeout: float = Field(default=5.0, gt=0, description="longest wait for a reply [s]")
     lease: float | None = Field(
         default=None,
@@ -41,10 +72,65 @@ class BusConfig(Strict):
         description="who is silent for so long counts as dead [s]; 1 by default, 10 in lockstep, where nothing moves",
     )
 
+    @model_validator(mode="after")
+    def _guarded(self) -> Self:
+        guarded = self.endpoint.startswith("tls/")
+        if guarded and self.tls is None:
+            expected = "tls: {folder: ...}; `extrinsic lab init` makes them"
+            raise Refusal("a tls endpoint needs keys", expected, at=("endpoint",))
+        if self.tls is not None and not guarded:
+            raise Refusal("keys are of no use at a tcp endpoint", "an endpoint that begins with tls/", at=("tls",))
+        if guarded and self.mode == "peer":
+            raise Refusal("peers would go round the router and its access rules", "client", at=("mode",))
+        if guarded and self.insecure:
+            raise Refusal("a tls endpoint is not insecure", "no such key", at=("insecure",))
+        return self
+
 
 class _Device(Strict):
     backend: Literal["sim"] = "sim"
     serial: str = "sim"
+
+
+Span = tuple[float, float]
+
+
+class ArmLimits(Strict):
+    """What an arm's server lets pass, and what stops the arm (`drivers.gates`). Cautious: a person stands beside it.
+
+    ``force`` and ``torque`` are of what the wrist's sensor reads, the tool's weight among it unless it was tared away.
+    """
+
+    x: Span = Field(default=(-0.4, 0.4), description="workspace of the end-effector [m]")
+    y: Span = Field(default=(0.0, 0.6), description="and its height [m]")
+    angle_deg: Span = (-100.0, 100.0)
+    step_mm: float = Field(default=50.0, gt=0, description="from one set-point to the next")
+    step_deg: float = Field(default=30.0, gt=0)
+    speed: float = Field(default=0.25, gt=0, description="the reduced speed of ISO 10218 [m/s]")
+    turn_speed_deg: float = Field(default=150.0, gt=0, description="[deg/s]")
+    acceleration: float = Field(default=6.0, gt=0, description="[m/s²]")
+    turn_acceleration_deg: float = Field(default=2000.0, gt=0, description="[deg/s²]")
+    age: float = Field(default=0.2, gt=0, description="how long a set-point may be under way [s]")
+    force: float = Field(default=40.0, gt=0, description="stops the arm [N]")
+    torque: float = Field(default=5.0, gt=0, description="stops the arm [N·m]")
+    jump: float = Field(default=8.0, gt=0, description="change of force at once, in mid-motion, that stops it [N]")
+    silence: float | None = Field(
+        default=None,
+        gt=0,
+        description="how long the wrist's sensor may be silent [s]; three of its periods, 20 ms at least in real time",
+    )
+    hold_after: float = Field(default=0.1, gt=0, description="silence of a commander in mid-motion: hold [s]")
+    stop_after: float = Field(default=1.0, gt=0, description="and then: stop [s]")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        for name in ("x", "y", "angle_deg"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise Refusal(f"{low:g} to {high:g} is no span", "the smaller figure first", at=(name,))
+        if self.stop_after < self.hold_after:
+            raise Refusal("it would stop before it holds", "stop_after of at least hold_after", at=("stop_after",))
+        return self
 
 
 class ArmConfig(_Device):
@@ -52,6 +138,7 @@ class ArmConfig(_Device):
 
     kind: Literal["arm"]
     rate: float = Field(default=100.0, gt=0, le=1000)
+    limits: ArmLimits = ArmLimits()
 
 
 class GripperConfig(_Device):

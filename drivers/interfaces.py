@@ -338,6 +338,11 @@ class Arm(Sensor[PoseReading]):
     def command(self, target: ArmTarget) -> None:
         """Send one set-point. Raises CommandRefused (no lease, not finite, stopped …), DeviceFault."""
 
+    def reachable(self, pose: Array) -> str:
+        """Why the arm cannot be at planar ``pose`` (3,): a joint's limit, say; "" where it can, or nobody knows."""
+        del pose
+        return ""
+
     @abstractmethod
     def hold(self) -> None:
         """Stay where the arm is now. Needs no lease."""
@@ -368,6 +373,15 @@ class Simulation(Protocol):
 
     def reset(self, seed: int, scene: dict) -> None:
         """Put the world into its initial state: a `drivers.scene.Scene` as a dict. Stamps start again at 0."""
+        ...
+
+    def restage(self, scene: dict, part: int = 0) -> None:
+        """Begin part ``part`` of a run with another `drivers.scene.Scene`: all is as after a reset, but time goes on.
+
+        So do faults, seed and lab. The arm rests at the scene's start, streams count from 0, and what is drawn at
+        random follows from the seed and ``part`` alone, whatever ran before. Raises CommandRefused, and changes
+        nothing, for a scene that cannot be.
+        """
         ...
 
     def regrasp(self, trial: int) -> None:

@@ -9,25 +9,32 @@ from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import cast
-from urllib.parse import urlsplit
+
+import numpy as np
 
 from drivers.config import StationConfig
 from drivers.errors import DriverError, NotConnected
 from drivers.hosting import HostProcess, StationHost
 from drivers.interfaces import Arm, Device, ForceTorqueSensor, Gripper, TactileSensor, TagCamera
-from drivers.wire import topics
+from drivers.wire import messages, topics
 from drivers.wire.bus import Bus
-from drivers.wire.client import REMOTES, RemoteSensor
+from drivers.wire.client import REMOTES
 from drivers.wire.clock import RemoteClock, RemoteSimulation
+from drivers.wire.codec import encode_reading
 from drivers.wire.link import Link
 from drivers.wire.log import LogWriter
+from drivers.wire.remote import RemoteSensor
+from drivers.wire.session import address
+from drivers.wire.station_bus import refuse_open_door, station_bus
+from drivers.wire.streams import Publisher
 from drivers.wire.watch import Watch
+from mechanics.readings import Array, Stamp, WrenchReading
 
 Hosting = Callable[[StationConfig], StationHost]
 """What makes the host of a simulated station."""
 
 _PROBE = 1.0
-_PROTOCOL = 1
+_PROTOCOL = 2
 
 
 class Devices(Mapping[str, Device]):
@@ -49,6 +56,7 @@ class Devices(Mapping[str, Device]):
     ):
         self.config, self.bus, self.clock, self.simulation, self.host = config, bus, clock, simulation, host
         self._devices, self._link, self._watch = devices, link, watch
+        self._estimates: Publisher | None = None
 
     def __getitem__(self, name: str) -> Device:
         return self._devices[name]
@@ -107,6 +115,16 @@ class Devices(Mapping[str, Device]):
         # the answer comes after the host has heard of the subscriptions
         self._link.ask(topics.WORLD, "describe", watch=self._watch)
 
+    def tell_wrench(self, wrench: Array) -> None:
+        """Publish the wrench (fx, fy, τ) that the fingers tell, axes of W: a second witness of the arm's gates."""
+        if self._estimates is None:
+            topic = topics.key(self.config.name, topics.ESTIMATOR, next(iter(topics.STREAMS["force_torque"])))
+            self._estimates = self.bus.publisher(topic, messages.WRENCH)
+        fx, fy, tau = map(float, wrench)
+        stamp = Stamp(self.clock.now_ns(), self.clock.now_ns(), self._estimates.newest + 1, "world")
+        reading = WrenchReading(stamp, np.array([fx, 0.0, fy, 0.0, -tau, 0.0]))
+        self._estimates.put(encode_reading(reading), stamp.sequence, stamp.capture_ns)
+
     def log(self, path: Path | str) -> LogWriter:
         """A new log with the station attached; close it."""
         writer = LogWriter(path, flush=self.config.log.flush)
@@ -156,20 +174,21 @@ class Connection:
     def _open(self, stack: ExitStack) -> Devices:
         config = self.config
         endpoint = config.bus.endpoint
+        routed = config.bus.mode == "client"
         if not listening(endpoint):
-            if config.world is None or any(device.backend != "sim" for device in config.devices.values()):
+            if routed or config.world is None or any(device.backend != "sim" for device in config.devices.values()):
+                starting = "the router with `extrinsic lab router" if routed else "the station with `extrinsic serve"
                 raise NotConnected(
                     config.name,
                     f"connect to {endpoint}",
                     "nothing listens there",
-                    "Start the station with `extrinsic serve STATION`, or correct bus.endpoint",
+                    f"Start {starting} STATION`, or correct bus.endpoint",
                 )
+            refuse_open_door(config)
             self.host = stack.enter_context(self._made_by(config))
         bus = None if self.host is None else self.host.bus
         if bus is None:
-            bus = stack.enter_context(
-                Bus(endpoint, timeout=config.bus.timeout, shared_memory=False, lease=config.lease)
-            )
+            bus = stack.enter_context(station_bus(config, "runner"))
         watch = bus.watch(topics.alive(config.name, topics.WORLD))
         stack.callback(self._abandon, watch)
         if not watch.seen(config.bus.timeout):
@@ -177,7 +196,9 @@ class Connection:
                 config.name,
                 f"connect to {endpoint}",
                 f"whatever listens there does not serve station '{config.name}'",
-                "Another station or program has the port; change bus.endpoint or end it",
+                "Start it with `extrinsic serve STATION`; a certificate that was revoked sees nothing either"
+                if routed
+                else "Another station or program has the port; change bus.endpoint or end it",
             )
         link = Link(bus, config.name)
         reply = link.ask(topics.WORLD, "describe", watch=watch)
@@ -212,9 +233,9 @@ class Connection:
 
 def listening(endpoint: str) -> bool:
     """Whether anything accepts connections at an endpoint like ``tcp/127.0.0.1:7447``."""
-    address = urlsplit("//" + endpoint.split("/", 1)[1])
+    where = address(endpoint)
     try:
-        with socket.create_connection((address.hostname or "", address.port or 0), timeout=_PROBE):
+        with socket.create_connection((where.hostname or "", where.port or 0), timeout=_PROBE):
             return True
     except OSError:
         return False

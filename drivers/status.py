@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from typing import Any
 
 from drivers.config import StationConfig
 from drivers.errors import DriverError
 from drivers.station import listening
-from drivers.wire.bus import Bus
-from drivers.wire.client import REMOTES, RemoteSensor
+from drivers.wire.client import REMOTES, RemoteArm
 from drivers.wire.link import Link
+from drivers.wire.remote import RemoteSensor
+from drivers.wire.station_bus import certificates, station_bus
 
 NANO = 1e-9
 
@@ -38,7 +40,7 @@ def station_status(config: StationConfig, seconds: float = 1.0) -> list[DeviceSt
     if not listening(endpoint):
         note = f"nothing listens at {endpoint}"
         return [DeviceStatus(name, d.kind, d.backend, False, note=note) for name, d in config.devices.items()]
-    with Bus(endpoint, timeout=config.bus.timeout, shared_memory=False, lease=config.lease) as bus:
+    with station_bus(config, "viewer") as bus:
         link = Link(bus, config.name)
         devices = {name: REMOTES[device.kind](name, link, False) for name, device in config.devices.items()}
         failures: dict[str, str] = {}
@@ -61,6 +63,26 @@ def station_status(config: StationConfig, seconds: float = 1.0) -> list[DeviceSt
                 device.close()
 
 
+def station_certificates(config: StationConfig) -> list[tuple[str, int]]:
+    """Every certificate of the station that lies on this machine, by name, with the days that it has left.
+
+    Empty for a station without keys. Raises NotConnected for a file that is no certificate.
+    """
+    return [] if config.bus.tls is None else certificates(config.bus.tls)
+
+
+def _gates(found: dict[str, Any]) -> list[str]:
+    """What the gates of an arm have to tell."""
+    notes = [f"stopped: {found['stopped']}"] if found["stopped"] else []
+    if found["held"]:
+        notes.append(f"held: {found['held']}")
+    if refused := sum(found["refused"].values()):
+        gates = ", ".join(f"{gate} {count}" for gate, count in found["refused"].items())
+        said = f"refused {refused} of {refused + found['accepted']} set-points ({gates})"
+        notes.append(f"{said}, the last: {found['refusal']}")
+    return notes
+
+
 def _row(config: StationConfig, device: RemoteSensor, since_ns: int, seconds: float) -> DeviceStatus:
     known = config.devices[device.name]
     arrivals = device.arrivals(since_ns)
@@ -69,9 +91,10 @@ def _row(config: StationConfig, device: RemoteSensor, since_ns: int, seconds: fl
         alive, notes = True, [described.model]
     except DriverError as error:
         alive, notes = False, [error.got]
-    if known.kind == "arm":
+    if isinstance(device, RemoteArm) and alive:
         holders = device.lease_holders()
         notes.append(f"commanded by {', '.join(holders)}" if holders else "nobody commands it")
+        notes += _gates(device.safety())
     if alive and not arrivals and config.world is not None and config.world.clock == "lockstep":
         notes.append("silent: lockstep time stands still")
     return DeviceStatus(

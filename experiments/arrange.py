@@ -6,28 +6,23 @@ import numpy as np
 
 from control.approach import resting_eo
 from control.motion import Mover
-from control.observe import Observer
 from drivers.station import Devices
 from experiments import setup
 from experiments.context import RunContext
 from planning.plan import Plan
 
 
-def arrange(context: RunContext, devices: Devices, observer: Observer, plan: Plan, trial: int) -> None:
+def arrange(context: RunContext, devices: Devices, plan: Plan, trial: int) -> None:
     """Put the scene into the state that ``trial`` of ``plan`` begins with.
 
     The simulated world does it by itself; a person is asked by the trial, which looks at the tags. Raises DriverError.
     """
-    eo, simulation = resting_eo(plan), devices.simulation
-    if eo is not None:
-        pose = (float(eo[0]), float(eo[1]), float(eo[2]))
-        scene = setup.scene(context.resolved, pose)
-        _lift(context, devices, observer, scene.start[1])
-        if simulation is not None:
-            _tell_health(context, devices)
-            simulation.rearrange(scene.model_dump())
-    if simulation is not None:
-        simulation.regrasp(trial)
+    eo = resting_eo(plan)
+    scene = setup.scene(context.resolved, None if eo is None else (float(eo[0]), float(eo[1]), float(eo[2])))
+    if devices.simulation is not None:
+        context.begin(scene, trial=trial)
+    elif eo is not None:
+        _lift(context, devices, scene.start[1])
 
 
 def hold(devices: Devices, plan: Plan, phase: str) -> None:
@@ -40,20 +35,12 @@ def hold(devices: Devices, plan: Plan, phase: str) -> None:
         devices.simulation.clamp(None)
 
 
-def _lift(context: RunContext, devices: Devices, observer: Observer, height: float) -> None:
+def _lift(context: RunContext, devices: Devices, height: float) -> None:
     """Raise the end-effector, straight up, to where the go hangs clear of the extrinsic object; it hangs upright."""
-    settings, here = context.settings, observer.arm_pose()
-    mover = Mover(
-        devices.arm, devices.clock, settings.control_rate, here, settings.approach_speed, context.check_interrupt
-    )
+    settings = context.settings
+    here = setup.observer(context.resolved, devices, settings, context.believed).arm_pose()
+    mover = Mover(devices.arm, devices.clock, settings.control_rate, here, settings.approach_speed, context.heed)
     for goal in ([here[0], max(here[1], height), here[2]], [here[0], max(here[1], height), 0.0]):
         if np.abs(np.asarray(goal) - mover.pose).max() > 1e-6:
             mover.travel(np.asarray(goal, float))
     mover.rest(settings.window)
-
-
-def _tell_health(context: RunContext, devices: Devices) -> None:
-    """What was not well with the plant until now: a rearranged world counts anew."""
-    assert devices.simulation is not None
-    for flag in devices.simulation.health()["flags"]:
-        context.event("warning", f"the simulated plant: {flag}")

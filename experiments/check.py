@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import inf
+from pathlib import Path
+from types import MappingProxyType
 from typing import get_args
 
 from control.approach import resting_eo as resting
-from drivers.config import ForceTorqueConfig, TactileConfig, WorldConfig
+from control.motion import PEAK
+from drivers.config import ArmConfig, ForceTorqueConfig, TactileConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
 from experiments.calibrate.schema import CameraStage, FrictionStage
 from experiments.calibrate.store import Calibrations, load
+from experiments.faults.schema import FaultsStage
 from experiments.files import Resolved
 from experiments.planning.files import plan_files
 from experiments.planning.make import resting_eo, task, try_start
@@ -26,18 +31,24 @@ from planning.skills.base import SkillTask
 FINGERS = get_args(TactileConfig.model_fields["sensor"].annotation)
 
 
-def check(resolved: Resolved, calibrations: Calibrations | None = None, feasible: bool = True) -> list[str]:
+def check(
+    resolved: Resolved,
+    calibrations: Calibrations | None = None,
+    feasible: bool = True,
+    own: Mapping[str, Path] = MappingProxyType({}),
+) -> list[str]:
     """What would run, in lines for a person. Raises InputError, and InfeasiblePlan for a task that has no plan.
 
     ``calibrations`` are those that the run uses, by default what `experiments.calibrate.store.load` finds. Without
     ``feasible``, whether there is a plan is left to the plan stage, which leaves its answer in the run's folder.
+    ``own`` as `experiments.planning.files.plan_files` has it.
     """
     calibrations = load(resolved) if calibrations is None else calibrations
     problems = _device_problems(resolved) + _scene_problems(resolved)
     if problems:
         raise InputError(problems)
     made = tasks(resolved, believed(resolved, calibrations), feasible)
-    plans = plan_files(resolved)
+    plans = plan_files(resolved, own)
     problems = [
         problem
         for eo in {*map(resting_eo, made.values()), *map(_resting_of_plan, plans.values())} - {None}
@@ -72,6 +83,9 @@ def check(resolved: Resolved, calibrations: Calibrations | None = None, feasible
             trials += stage.trials * len(stage.controllers)
             count = f"{stage.trials} trial{'s' if stage.trials > 1 else ''} each"
             lines.append(f"stage {number}: execute {stage.plan}: {', '.join(stage.controllers)}, {count}")
+        elif isinstance(stage, FaultsStage):
+            trials += stage.count
+            lines.append(f"stage {number}: faults in {stage.plan}: {stage.controller}, {stage.count} cells")
         else:
             pair = f" of {stage.pair}" if isinstance(stage, FrictionStage) else ""
             lines.append(f"stage {number}: {stage.stage.replace('_', ' ')}{pair}")
@@ -171,6 +185,14 @@ def _device_problems(resolved: Resolved) -> list[Problem]:
         wrong = f"{named} is not what the station {station.name} holds with: {', '.join(others)}"
         expected = f"{one_of(set(fingers.values()))}, or a station with {named} fingers"
         problems.append(resolved.experiment_document.problem(("sensor",), wrong, expected))
+    trial = resolved.experiment.trial
+    fastest = PEAK * max(trial.approach_speed, trial.touch_speed) * trial.speed
+    for arm in station.devices.values():
+        if isinstance(arm, ArmConfig) and fastest > arm.limits.speed:
+            wrong = f"{trial.approach_speed:g} m/s on the mean is {fastest:.3g} m/s in the middle of a motion"
+            limit = arm.limits.speed
+            expected = f"at most {limit / PEAK / trial.speed:.3g} m/s: the arm's limits.speed is {limit:g} m/s"
+            problems.append(resolved.experiment_document.problem(("trial", "approach_speed"), wrong, expected))
     if not station.table_tags:
         problems.append(document.problem(("table_tags",), "the table has no tags", "at least one tag"))
     if resolved.grasped.tag is None:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated
 
 import typer
 from rich.console import Console
 
 from experiments import kernels
+from experiments.command import Sets, StationName, commands
 from experiments.exit_codes import ExitCode
+from experiments.lab.commands import app as lab
 
 app = typer.Typer(
     name="extrinsic",
@@ -25,69 +25,58 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-Command = TypeVar("Command", bound=Callable[..., None])
-
-
-def command(example: str) -> Callable[[Command], Command]:
-    """Register a command with an example; each way to fail ends with its exit code and one clear message."""
-
-    def register(function: Command) -> Command:
-        @wraps(function)
-        def orderly(*arguments: Any, **options: Any) -> None:
-            from drivers.errors import DriverError
-            from mechanics.yaml_input import InputError
-            from planning.errors import InfeasiblePlan
-
-            try:
-                function(*arguments, **options)
-            except InputError as error:
-                raise _ended(error, ExitCode.BAD_INPUT) from None
-            except InfeasiblePlan as error:
-                raise _ended(error, ExitCode.INFEASIBLE) from None
-            except DriverError as error:
-                raise _ended(error, ExitCode.DEVICE_FAILED) from None
-            except KeyboardInterrupt:
-                raise typer.Exit(ExitCode.INTERRUPTED) from None
-
-        app.command(epilog=f"Example: {example}")(orderly)
-        return function
-
-    return register
-
-
-def _ended(error: Exception, code: ExitCode) -> typer.Exit:
-    sys.stderr.write(f"{error}\n")
-    return typer.Exit(code)
-
+command = commands(app)
+app.add_typer(lab)
 
 Experiment = Annotated[str, typer.Argument(metavar="EXPERIMENT", help="An experiment file, or a shipped one's name.")]
-StationName = Annotated[str, typer.Argument(metavar="STATION", help="A station file, or a shipped one's name.")]
 StationOption = Annotated[
     str | None,
     typer.Option("--station", metavar="STATION", help="Run on this station, not the experiment's own."),
-]
-Sets = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Set a key of the experiment or the station; may be repeated."),
 ]
 
 
 @command("extrinsic run grasped_pivoting --set world.stiffness_scale=0.8")
 def run(
-    experiment: Experiment,
+    experiment: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[EXPERIMENT]", help="An experiment file, or a shipped one's name; may be left out with --resume."
+        ),
+    ] = None,
     station: StationOption = None,
     sets: Sets = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="The run folder, new or empty.")] = None,
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="The plans' motions in free air, in place of trials; touches nothing.")
+    ] = False,
+    speed: Annotated[
+        float | None, typer.Option("--speed", metavar="SHARE", help="Every motion at this share of its speed: 0.2.")
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option("--resume", metavar="RUN", help="Go on with the run in this folder where it was cut off."),
+    ] = None,
 ) -> None:
     """Run an experiment: plan, execute, log, measure, report."""
     from experiments import runner
     from experiments.files import load
-    from experiments.tables import error_table
+    from experiments.resume import refuse_besides
+    from experiments.resume import resume as go_on
+    from experiments.tables import error_table, faults_table
+    from mechanics.yaml_input import InputError, Problem
 
-    resolved = load(experiment, station, sets or [])
-    outcome = runner.run(resolved, out, Console(stderr=True))
+    chosen = [*(sets or []), *(["rehearse=true"] if rehearse else [])]
+    chosen += [] if speed is None else [f"trial.speed={speed:g}"]
+    if resume is not None:
+        refuse_besides({"--set": sets, "--out": out, "--rehearse": rehearse, "--speed": speed})
+        outcome = go_on(resume, experiment, station, Console(stderr=True))
+    elif experiment is None:
+        raise InputError([Problem("run", None, "EXPERIMENT", "it is missing", "an experiment, or --resume RUN")])
+    else:
+        outcome = runner.run(load(experiment, station, chosen), out, Console(stderr=True))
     console = Console()
-    console.print("", error_table(outcome.results), "", sep="\n")
+    faults = outcome.results.get("faults")
+    console.print("", faults_table(faults) if faults else error_table(outcome.results), "", sep="\n")
     if outcome.exit_code is not ExitCode.DONE:
         Console(stderr=True, soft_wrap=True).print(f"[red]{outcome.results['status']}[/]: {outcome.reason}")
     console.print(f"report: {outcome.folder.report}", soft_wrap=True, highlight=False)
@@ -112,12 +101,17 @@ def serve(
         list[str] | None, typer.Argument(metavar="[DEVICE]...", help="Serve only these devices; all by default.")
     ] = None,
     sets: Sets = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Listen without keys where other machines can reach it.")
+    ] = False,
 ) -> None:
     """Put a station's devices on the bus, until Ctrl-C."""
     from drivers.sim.host import serve as serve_simulated
     from experiments.files import load_station
 
     config = load_station(station, sets or [], devices or None)
+    if insecure:
+        config = config.model_copy(update={"bus": config.bus.model_copy(update={"insecure": True})})
     console = Console(stderr=True)
     what = f"serving {', '.join(config.devices)} at {config.bus.endpoint}; Ctrl-C ends it"
     raise typer.Exit(serve_simulated(config, lambda _host: console.print(what, highlight=False, soft_wrap=True)))
@@ -126,13 +120,35 @@ def serve(
 @command("extrinsic status sim")
 def status(station: StationName, sets: Sets = None) -> None:
     """Show every device of a station: alive, rate, age, faults."""
-    from drivers.status import station_status
+    from drivers.status import station_certificates, station_status
     from experiments.files import load_station
     from experiments.tables import status_table
 
-    rows = station_status(load_station(station, sets or []))
-    Console().print(status_table(rows))
+    config = load_station(station, sets or [])
+    rows = station_status(config)
+    Console().print(status_table(rows, station_certificates(config)))
     raise typer.Exit(ExitCode.DONE if all(row.alive for row in rows) else ExitCode.DEVICE_FAILED)
+
+
+@command("extrinsic stop sim")
+def stop(station: StationName, sets: Sets = None) -> None:
+    """Stop a station's arm now; it stays stopped until `recover`. Needs no lease, and no run's consent."""
+    from drivers.safety import stop as stop_arms
+    from experiments.files import load_station
+
+    for arm in stop_arms(load_station(station, sets or [])):
+        Console().print(f"{arm.name} is stopped: {arm.reason}", soft_wrap=True, highlight=False)
+
+
+@command("extrinsic recover sim")
+def recover(station: StationName, sets: Sets = None) -> None:
+    """Release a latched stop, once its reason is gone; nothing moves by that."""
+    from drivers.safety import recover as recover_arms
+    from experiments.files import load_station
+
+    for arm in recover_arms(load_station(station, sets or [])):
+        said = f"was stopped: {arm.reason}; it takes set-points again" if arm.reason else "was not stopped"
+        Console().print(f"{arm.name} {said}", soft_wrap=True, highlight=False)
 
 
 @command("extrinsic report runs/grasped_pivoting-20260101T120000.000000")
@@ -146,6 +162,16 @@ def report(
     folder = RunFolder.open(run_folder)
     build_report(folder)
     Console().print(f"report: {folder.report}", soft_wrap=True, highlight=False)
+
+
+@command("extrinsic repair runs/grasped_pivoting-20260101T120000.000000")
+def repair(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+) -> None:
+    """Mend a log that was cut off, beside it; rebuild results.json and the report."""
+    from experiments import repair as mending
+
+    mending.say(mending.repair(run_folder), Console())
 
 
 @command("extrinsic bench sim --check")

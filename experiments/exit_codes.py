@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -15,6 +16,8 @@ class ExitCode(IntEnum):
     DEVICE_FAILED = 3
     STOPPED = 4
     INFEASIBLE = 5
+    FAILED = 70
+    """An exception that nobody has foreseen: a defect of this program or of a plug-in (EX_SOFTWARE)."""
     INTERRUPTED = 130
 
 
@@ -25,6 +28,7 @@ STATUS = {
     ExitCode.DEVICE_FAILED: "device_failed",
     ExitCode.STOPPED: "stopped",
     ExitCode.INFEASIBLE: "infeasible",
+    ExitCode.FAILED: "failed",
     ExitCode.INTERRUPTED: "interrupted",
 }
 _OF_TRIAL = {
@@ -39,9 +43,12 @@ _OF_TRIAL = {
 _SEVERITY = (ExitCode.DONE, ExitCode.FELL_SHORT, ExitCode.STOPPED, ExitCode.DEVICE_FAILED)
 
 
-def of_trials(trials: list[dict[str, Any]]) -> tuple[ExitCode, str]:
-    """The exit code that the worst of ``trials`` (rows of results.json) makes, and its reason."""
+def of_trials(trials: list[dict[str, Any]], faults: Sequence[dict[str, Any]] = ()) -> tuple[ExitCode, str]:
+    """The exit code that the worst of ``trials`` and ``faults`` (rows of results.json) makes, and its reason."""
     worst, reason = ExitCode.DONE, ""
+    for cell in faults:
+        if cell["short"] and worst is ExitCode.DONE:
+            worst, reason = ExitCode.FELL_SHORT, f"{cell['name']}: {'; '.join(cell['short'])}"
     for trial in trials:
         code = _OF_TRIAL[trial["status"]]
         if _SEVERITY.index(code) > _SEVERITY.index(worst):

@@ -1,16 +1,21 @@
-"""Ctrl-C and SIGTERM: one orderly end, at any moment, that nothing cuts short."""
+"""Ctrl-C, SIGTERM and a terminal that is closed: one orderly end, at any moment, that nothing cuts short."""
 
 from __future__ import annotations
 
 import signal
 import sys
 import threading
+from contextlib import suppress
 from types import FrameType
 from typing import Self
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
 
 class Interrupt:
-    """While it is entered, the first SIGINT or SIGTERM raises KeyboardInterrupt; later ones only say to wait.
+    """While it is entered, the first of `SIGNALS` raises KeyboardInterrupt; later ones only say to wait.
+
+    A SIGHUP that is ignored already stays so: that is what nohup asks for.
 
     A library may swallow the exception where it is raised (in a callback, in a destructor), so the loops call `check`,
     which raises it again. Once `closing` was called nothing raises any more: the arm is being held and the log closed.
@@ -22,9 +27,9 @@ class Interrupt:
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():  # Python allows handlers nowhere else
-            self._before = {
-                number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)
-            }
+            for number in SIGNALS:
+                if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
+                    self._before[number] = signal.signal(number, self._on_signal)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -33,7 +38,8 @@ class Interrupt:
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         if self._requested or self._closing:
-            sys.stderr.write("closing: the arm is held and the log is being written\n")
+            with suppress(OSError, ValueError):  # the terminal may have gone
+                sys.stderr.write("closing: the arm is held and the log is being written\n")
             return
         self._requested = True
         raise KeyboardInterrupt

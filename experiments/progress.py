@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from typing import IO, Any, cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -32,6 +33,33 @@ def counted(console: Console, speed_over: float = 30.0) -> Bars:
         console=console,
         speed_estimate_period=speed_over,
     )
+
+
+class _Steady:
+    """A stream that takes what is written whether anybody is left to read it or not."""
+
+    def __init__(self, file: IO[str]):
+        self._file = file
+
+    def write(self, text: str) -> int:
+        """Write ``text`` if that is possible."""
+        with suppress(OSError, ValueError):
+            self._file.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush if that is possible."""
+        with suppress(OSError, ValueError):
+            self._file.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+def outlive_terminal(console: Console) -> None:
+    """Let ``console`` go on when its terminal is closed, or the pipe behind it: a run has to end in order."""
+    if not isinstance(console.file, _Steady):
+        console.file = cast("IO[str]", _Steady(console.file))
 
 
 class Progress:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from drivers.wire.log_repair import MENDED, mended_path
 from mechanics.yaml_input import InputError, Problem
+
+_LOG = re.compile(rf"log(?:\.([0-9]{{1,9}}))?(?:{re.escape(MENDED)})?\.mcap")
 
 
 class RunFolder:
@@ -45,6 +49,18 @@ class RunFolder:
             ) from None
         return cls(path)
 
+    def written_logs(self) -> list[Path]:
+        """The logs as runs wrote them, in their order: ``log.mcap``, and ``log.1.mcap`` … of a run that went on.
+
+        One of which only the mended form is left is among them.
+        """
+        found = {int(match[1] or 0) for file in self.path.glob("log*.mcap") if (match := _LOG.fullmatch(file.name))}
+        return [self.path / (f"log.{number}.mcap" if number else "log.mcap") for number in sorted(found)]
+
+    def logs(self) -> list[Path]:
+        """The logs to read, in their order: each in its mended form, where there is one."""
+        return [mended if (mended := mended_path(log)).is_file() else log for log in self.written_logs()]
+
     @classmethod
     def open(cls, path: Path) -> RunFolder:
         """An existing run folder. Raises InputError when there is none."""
@@ -54,15 +70,27 @@ class RunFolder:
             )
         return cls(path)
 
+    def next_log(self) -> Path:
+        """Where the next log goes: log.mcap, then log.1.mcap, log.2.mcap, …; none that lies here is touched."""
+        path, number, written = self.log, 0, self.written_logs()
+        while path in written or path.exists():
+            number += 1
+            path = self.log.with_name(f"{self.log.stem}.{number}{self.log.suffix}")
+        return path
+
 
 def write_atomic(path: Path, text: str) -> None:
     """Write aside, fsync, rename: a reader sees the old file or the new one, never a half."""
     aside = path.with_name(f".{path.name}.{os.getpid()}")
-    with aside.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    try:
+        with aside.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.replace(path)
+    except BaseException:  # a full disk, most likely, and it is not to be filled by this
+        aside.unlink(missing_ok=True)
+        raise
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -1,12 +1,17 @@
-"""Runs an experiment from resolved files to the run folder, and ends in order however it ends."""
+"""Runs an experiment from resolved files to the run folder, and ends in order however it ends.
+
+A run is a transaction: after every stage and every trial results.json says what is finished, and `experiments.resume`
+goes on from there.
+"""
 
 from __future__ import annotations
 
 import gc
 import sys
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -14,11 +19,12 @@ from typing import Any
 
 from rich.console import Console
 
-from drivers.errors import CommandRefused, DriverError
+from drivers.errors import DriverError
 from drivers.hosting import HostProcess
 from drivers.station import Hosting
 from drivers.wire.log import LogWriter
 from estimation.errors import FitError
+from experiments import disk
 from experiments.calibrate import store
 from experiments.calibrate.store import Calibrations
 from experiments.check import check
@@ -26,14 +32,20 @@ from experiments.context import RunContext
 from experiments.exit_codes import STATUS, ExitCode, of_trials
 from experiments.files import Resolved, dump_resolved
 from experiments.interrupt import Interrupt
-from experiments.progress import Progress
+from experiments.planning.schema import PlanStage
+from experiments.planning.stage import take_plan_again
+from experiments.progress import Progress, outlive_terminal
 from experiments.provenance import provenance
 from experiments.report.build import build_report
 from experiments.run_folder import RunFolder, write_atomic, write_json
+from experiments.run_lock import RunLock
 from experiments.stages import STAGES, has_diverged, skip_stages
+from mechanics.yaml_input import InputError, Problem
 from planning.errors import InfeasiblePlan
 
 INTERRUPTED = "interrupted by the user"
+#: where the traceback of an exception goes that nobody has foreseen
+TRACEBACK = "traceback.txt"
 
 
 @dataclass(frozen=True)
@@ -53,13 +65,22 @@ def run(
 
     ``host`` serves a simulated station that does not run yet. A process of its own keeps its crash from this one.
     """
-    console = console or Console(stderr=True)
-    _keep_what_is_here()
     calibrations = store.load(resolved)
     check(resolved, calibrations, feasible=False)  # bad input is found before anything is written
+    disk.require_room(resolved, out or Path("runs"))
     folder = RunFolder.create(resolved.experiment.name, out)
-    write_atomic(folder.experiment, dump_resolved(resolved))
-    results: dict[str, Any] = {
+    with RunLock(folder.path):
+        try:
+            write_atomic(folder.experiment, dump_resolved(resolved))
+        except OSError as error:
+            wrong, expected = f"cannot be written: {error.strerror}", "a folder you may write to, on a disk with room"
+            raise InputError([Problem(str(folder.experiment), None, "--out", wrong, expected)]) from None
+        return carry_out(resolved, calibrations, folder, begun(resolved, calibrations), console, host)
+
+
+def begun(resolved: Resolved, calibrations: Calibrations) -> dict[str, Any]:
+    """The results of a run that begins."""
+    return {
         "schema": 1,
         "status": "running",
         "reason": "",
@@ -75,7 +96,25 @@ def run(
         "not_run": [],
         "tables": [],
         "timing": {"execute_wall_s": 0.0, "execute_station_s": 0.0},
+        "progress": {"stage": 0, "trials": 0, "t_ns": 0},
+        "health": None,
+        "log": None,
     }
+
+
+def carry_out(
+    resolved: Resolved,
+    calibrations: Calibrations,
+    folder: RunFolder,
+    results: dict[str, Any],
+    console: Console | None = None,
+    host: Hosting = HostProcess,
+) -> Outcome:
+    """Run what ``results`` do not have yet, into ``folder``, whose lock is held; however it ends, it returns."""
+    console = console or Console(stderr=True)
+    outlive_terminal(console)
+    _keep_what_is_here()
+    code, reason = ExitCode.DONE, ""
     with Interrupt() as interrupt:
         try:
             code, reason = _stages(resolved, calibrations, folder, results, console, interrupt, host)
@@ -84,9 +123,7 @@ def run(
         interrupt.closing()
         results["status"], results["reason"] = STATUS[code], reason
         results["finished"] = datetime.now(UTC).isoformat(timespec="seconds")
-        outcome = Outcome(code, folder, results, reason)
-        _finish(outcome, console)
-    return outcome
+        return _finish(Outcome(code, folder, results, reason), console)
 
 
 @cache
@@ -104,42 +141,77 @@ def _stages(
     interrupt: Interrupt,
     host: Hosting,
 ) -> tuple[ExitCode, str]:
-    """Run all stages with log and station open, close both in order, and say how it ended."""
-    progress = Progress(console)
-    code, reason = ExitCode.DONE, ""
-    with ExitStack() as closing:
-        log = closing.enter_context(LogWriter(folder.log, flush=resolved.station.log.flush))
+    """Run the stages that are left with log and station open, close both in order, and say how it ended."""
+    closing, context, cut_off = ExitStack(), None, True
+    try:
+        log = closing.enter_context(LogWriter(folder.next_log(), flush=resolved.station.log.flush))
         log.add_attachment("experiment.yaml", "application/yaml", folder.experiment.read_bytes())
-        ask, heed = _ask(console), interrupt.check
+        progress, ask, heed = Progress(console), _ask(console), interrupt.check
         context = RunContext(resolved, calibrations, folder, results, log, progress, closing, ask, heed, host)
-        context.save()
-        try:
-            for done, stage in enumerate(resolved.experiment.stages, 1):
-                STAGES[stage.stage](context, stage)
-                interrupt.check()
-                code, reason = of_trials(results["trials"])
-                if code in (ExitCode.DEVICE_FAILED, ExitCode.STOPPED) or has_diverged(results["trials"]):
-                    skip_stages(context, resolved.experiment.stages[done:])
-                    break
-        except InfeasiblePlan as error:
-            code, reason = ExitCode.INFEASIBLE, str(error)
-        except FitError as error:
-            code, reason = ExitCode.FELL_SHORT, f"the calibration found no answer: {error}"
-            context.event("error", reason)
-        except CommandRefused as error:
-            code, reason = ExitCode.DEVICE_FAILED, str(error)
-        except DriverError as error:
-            code, reason = ExitCode.DEVICE_FAILED, str(error)
-        except KeyboardInterrupt:
-            code, reason = ExitCode.INTERRUPTED, INTERRUPTED
-        interrupt.closing()
-        if code in (ExitCode.INFEASIBLE, ExitCode.INTERRUPTED, ExitCode.DEVICE_FAILED):
+        code, reason = _carried_out(context, interrupt)
+        cut_off = code is ExitCode.DEVICE_FAILED
+    except KeyboardInterrupt:
+        code, reason = ExitCode.INTERRUPTED, INTERRUPTED
+    except Exception as error:  # whatever it is: the arm is held, the log is closed, and the results say so
+        code, reason = _ended_by(error, folder)
+    interrupt.closing()
+    if context is not None:
+        if cut_off:
             context.event("error", reason)
         if code is ExitCode.DEVICE_FAILED and (said := _last_words(context)):
             context.event("error", f"the simulated host said: {said}")
-        results["health"] = _health(context)
-        results["log"] = _accounts(context, log)
+        context.note_health()
+        results["log"] = _accounts(context)
+    try:
+        closing.close()
+    except Exception as error:  # the rest was closed all the same
+        late, why = _ended_by(error, folder)
+        if code in (ExitCode.DONE, ExitCode.FELL_SHORT):
+            code, reason = late, why
     return code, reason
+
+
+def _carried_out(context: RunContext, interrupt: Interrupt) -> tuple[ExitCode, str]:
+    """The stages in their order; those that are finished already are only remembered."""
+    stages, results = context.resolved.experiment.stages, context.results
+    finished = results["progress"]["stage"]
+    for stage in stages[:finished]:
+        if isinstance(stage, PlanStage):
+            take_plan_again(context, stage)
+    context.save()
+    if results.get("resumed"):
+        context.event("info", f"resumed after {len(results['trials'])} trials")
+    for number, stage in enumerate(stages[finished:], finished + 1):
+        STAGES[stage.stage](context, stage)
+        interrupt.check()
+        code, reason = of_trials([*results["trials"], *results.get("rehearsals", ())])
+        if code in (ExitCode.DEVICE_FAILED, ExitCode.STOPPED) or has_diverged(results["trials"]):
+            skip_stages(context, stages[number:])
+            return code, reason
+        context.stage_done(number)
+    return of_trials([*results["trials"], *results.get("rehearsals", ())], results.get("faults", ()))
+
+
+def _ended_by(error: Exception, folder: RunFolder) -> tuple[ExitCode, str]:
+    """The exit code and the sentence of a run that ``error`` ended."""
+    match error:
+        case InfeasiblePlan():
+            return ExitCode.INFEASIBLE, str(error)
+        case FitError():
+            return ExitCode.FELL_SHORT, f"the calibration found no answer: {error}"
+        case DriverError():
+            return ExitCode.DEVICE_FAILED, str(error)
+        case OSError() if disk.is_full(error):
+            said = disk.not_written(error.filename, error.strerror or str(error), folder.path)
+            return ExitCode.DEVICE_FAILED, str(said)
+    where = folder.path / TRACEBACK
+    try:
+        with where.open("a", encoding="utf-8") as file:
+            file.write("".join(traceback.format_exception(error)))
+    except OSError:
+        traceback.print_exception(error)
+    said = f"{type(error).__name__}: {error}"
+    return ExitCode.FAILED, f"{said}. This is a defect, of extrinsic or of a plug-in; report it with {where}"
 
 
 def _last_words(context: RunContext) -> str:
@@ -148,42 +220,34 @@ def _last_words(context: RunContext) -> str:
     return "" if host is None else host.last_words()
 
 
-def _health(context: RunContext) -> dict[str, Any] | None:
-    """How well the simulated plant was; what was not well is an event, too. None where nothing was simulated."""
-    devices = context.opened
-    if devices is None or devices.simulation is None:
-        return None
-    try:
-        health = devices.simulation.health()
-    except DriverError:  # it has died, and the run's own error says so
-        return None
-    for flag in health["flags"]:
-        context.event("warning", f"the simulated plant: {flag}")
-    return health
-
-
-def _accounts(context: RunContext, log: LogWriter) -> dict[str, Any]:
+def _accounts(context: RunContext) -> dict[str, Any]:
     """What was logged beside what was published, per topic; ``lost`` is the difference."""
-    published: dict[str, int] = {}
-    devices = context.opened
-    if devices is not None and devices.simulation is not None:
-        try:
+    published: Mapping[str, int] = {}
+    devices, log = context.opened, context.log
+    try:
+        if devices is not None and devices.simulation is not None:
             published = devices.simulation.counts()
-        except DriverError:
-            published = {}
-    log.drain()
+        log.drain()
+    except DriverError:  # the station has died, or the log: the run's own error says so
+        pass
     logged = log.counts
     lost = sum(max(0, count - logged.get(topic, 0)) for topic, count in published.items()) + log.overflows
-    return {"file": context.folder.log.name, "messages": logged, "published": published, "lost": lost}
+    return {"file": log.path.name, "messages": logged, "published": published, "lost": lost}
 
 
-def _finish(outcome: Outcome, console: Console) -> None:
+def _finish(outcome: Outcome, console: Console) -> Outcome:
     """Results and report; a report that cannot be made never takes the results with it."""
-    write_json(outcome.folder.results, outcome.results)
+    try:
+        write_json(outcome.folder.results, outcome.results)
+    except OSError as error:
+        why = disk.not_written(outcome.folder.results, error.strerror or str(error), outcome.folder.path)
+        console.print(f"[red]{why}[/]", soft_wrap=True, highlight=False)
+        outcome = replace(outcome, exit_code=ExitCode.DEVICE_FAILED, reason=outcome.reason or str(why))
     try:
         build_report(outcome.folder)
     except Exception as error:  # the run is over and its data are safe: say it and go on
         console.print(f"[yellow]the report could not be made: {error}[/]\n  extrinsic report {outcome.folder.path}")
+    return outcome
 
 
 def _ask(console: Console) -> Callable[[str], bool]:

@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field
 from control.settings import TrialSettings
 from experiments import registries
 from experiments.calibrate.schema import CalibrationStage, CalibrationUse, FrictionStage, Pair
+from experiments.faults.schema import FaultsStage, TimedFault
 from experiments.planning.schema import PlanStage, Slug
 from mechanics.catalogue import ObjectModel, SensorModel
 from mechanics.yaml_input import Refusal, nearest, one_of, validated
@@ -54,6 +55,17 @@ class ReportConfig(_Model):
     playback_rate: float = Field(default=25.0, gt=0, le=200)
 
 
+class HealthConfig(_Model):
+    """What a checkpoint (before each trial) does while a sensor is not well: ``pause`` until it is, or only ``warn``.
+
+    A paused run is ended as ``device_failed`` after ``limit`` seconds of the station's time. A trial that a device cut
+    off is run again, where the device has come back within that time.
+    """
+
+    on_fault: Literal["pause", "warn"] = "pause"
+    limit: float = Field(default=30.0, gt=0, le=86400, description="longest pause [s]")
+
+
 def _known_controllers(names: tuple[str, ...]) -> tuple[str, ...]:
     known = registries.controllers()
     for i, name in enumerate(names):
@@ -81,6 +93,9 @@ class ExecuteStage(_Model):
     )
     trials: int = Field(default=1, ge=1, le=10_000)
     first: int = Field(default=0, ge=0, le=1_000_000, description="number of the first trial: the grasp is drawn by it")
+    faults: tuple[TimedFault, ...] = Field(
+        default=(), description="what goes wrong in each trial, where the station is simulated, and when"
+    )
 
     @classmethod
     def submodel(cls, key: str, data: dict[str, Any]) -> type[BaseModel] | None:
@@ -111,7 +126,7 @@ class ExecuteStage(_Model):
         return self.plan.endswith(PLAN_FILE)
 
 
-Stage = Annotated[PlanStage | ExecuteStage | CalibrationStage, Field(discriminator="stage")]
+Stage = Annotated[PlanStage | ExecuteStage | FaultsStage | CalibrationStage, Field(discriminator="stage")]
 
 
 class Experiment(_Model):
@@ -128,6 +143,8 @@ class Experiment(_Model):
         default_factory=dict, description="Coulomb coefficients by pair, where they are not the objects' own"
     )
     calibration: CalibrationUse = CalibrationUse()
+    health: HealthConfig = HealthConfig()
+    rehearse: bool = Field(default=False, description="the plans' motions in free air in place of trials: --rehearse")
     trial: TrialSettings = Field(default_factory=lambda: TrialSettings.model_validate({}))
     stages: Annotated[tuple[Stage, ...], Field(min_length=1)]
     report: ReportConfig = ReportConfig()
@@ -140,7 +157,7 @@ class Experiment(_Model):
                 if stage.name in plans:
                     raise Refusal(f"a second plan named {stage.name!r}", "a name of its own", at=("stages", i, "name"))
                 plans.append(stage.name)
-            elif isinstance(stage, ExecuteStage) and stage.plan not in plans and not stage.from_file:
+            elif isinstance(stage, ExecuteStage | FaultsStage) and stage.plan not in plans and not stage.from_file:
                 expected = one_of([*plans, "a plan file (.npz)"]) if plans else "a plan stage before it, or a plan file"
                 wrong = f"no plan named {stage.plan!r} comes before this stage"
                 raise Refusal(wrong, expected, nearest(stage.plan, plans), at=("stages", i, "plan"))

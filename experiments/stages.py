@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from typing import Any
 
-from control.base import Controller, LawSettings
+from control.base import Controller
 from control.observe import Finger
 from control.trial import Trial, TrialResult, Watch
 from drivers.errors import DeviceTimeout, DriverError, SimulationDiverged
@@ -17,14 +19,19 @@ from drivers.station import Devices
 from experiments import kernels, registries, setup
 from experiments.arrange import arrange, hold
 from experiments.context import RunContext
+from experiments.faults.inject import Injector
 from experiments.metrics import contact_of, errors_of, witness_of
 from experiments.planning.stage import plan_stage, take_plan_files
+from experiments.rehearse import rehearse
 from experiments.schema import ExecuteStage, Stage
+from experiments.suspend import TRIES, Suspender
 from mechanics.records import PhaseRecord, PlanarState, TrialRecord, WaypointRecord
 from planning.plan import Plan
 
 #: how long fingers that do not answer yet are asked for their untouched pictures before the first trial [s]
 PATIENCE = 30.0
+#: statuses of trials that a resumed run repeats: what ended them was not the trial's own doing
+CUT_OFF = ("device_failed", "stopped")
 
 
 def execute_stage(context: RunContext, stage: ExecuteStage) -> None:
@@ -37,14 +44,42 @@ def execute_stage(context: RunContext, stage: ExecuteStage) -> None:
     plan = context.plans[stage.plan]
     if stage.restiffen:
         plan = plan.with_stiffness(context.believed.stiffness)
+    trials = [(trial, name) for trial in range(stage.first, stage.first + stage.trials) for name in stage.controllers]
+    left = trials[context.trials_done :]
+    if not left:  # it was cut off right after the last one
+        return
     devices = context.devices()
     _warm_up(context, stage)
     with devices.arm.lease(context.holder), context.timed(devices):
-        for trial in range(stage.first, stage.first + stage.trials):
-            for name in stage.controllers:
-                result = _one_trial(context, devices, plan, registries.controllers()[name], stage.law(name), trial)
-                if result.status in ("device_failed", "stopped", "diverged"):
-                    return
+        if context.resolved.experiment.rehearse:
+            rehearse(context, devices, plan)
+            return
+        suspender = Suspender(context, devices)
+        for trial, name in left:
+            result = _tried(context, devices, plan, registries.controllers()[name], stage, trial, suspender)
+            context.heed()
+            if result.status in (*CUT_OFF, "diverged"):
+                return
+
+
+def _tried(
+    context: RunContext,
+    devices: Devices,
+    plan: Plan,
+    controller: type[Controller],
+    stage: ExecuteStage,
+    trial: int,
+    suspender: Suspender,
+) -> TrialResult:
+    """Run a trial once the sensors are well, and again where one that cut it off has come back."""
+    attempt = 1
+    while True:
+        suspender.checkpoint()
+        result = _one_trial(context, devices, plan, controller, stage, trial)
+        if result.status != "device_failed" or attempt == TRIES or not suspender.has_come_back():
+            return result
+        context.results["trials"].pop()
+        attempt += 1
 
 
 def _warm_up(context: RunContext, stage: ExecuteStage) -> None:
@@ -66,8 +101,9 @@ def _warm_up(context: RunContext, stage: ExecuteStage) -> None:
 
 
 def _one_trial(
-    context: RunContext, devices: Devices, plan: Plan, controller: type[Controller], law: LawSettings, trial: int
+    context: RunContext, devices: Devices, plan: Plan, controller: type[Controller], stage: ExecuteStage, trial: int
 ) -> TrialResult:
+    law = stage.law(controller.name)
     name = f"{plan.name}-{controller.name}-{trial}"
     begin = TrialRecord(devices.clock.now_ns(), name, plan.skill, controller.name)
     context.write(begin)
@@ -79,6 +115,11 @@ def _one_trial(
         laws.append(controller(anchored, settings=law, **given))
         return laws[-1]
 
+    def tell(level: str, text: str) -> None:
+        context.event(level, f"{name}: {text}")
+
+    faults = Injector(stage.faults, devices.simulation, len(plan.ee), partial(tell, "warning"))
+
     with context.progress.steps(f"{controller.name} {trial + 1}", len(plan.ee)) as advance:
 
         def on_waypoint(record: WaypointRecord) -> None:
@@ -86,26 +127,31 @@ def _one_trial(
             waypoints.append(witnessed)
             context.write(witnessed)
             advance()
+            faults.waypoint(record.step)
 
         def on_phase(phase: str, fraction: float) -> None:
             context.write(PhaseRecord(devices.clock.now_ns(), name, phase))
             if fraction == 0.0:
                 hold(devices, plan, phase)
+            if fraction in (0.0, 1.0):
+                faults.phase(phase)
 
         watch = Watch(
             waypoint=on_waypoint,
-            tick=context.check_interrupt,
+            tick=context.heed,
             phase=on_phase,
-            event=lambda level, text: context.event(level, f"{name}: {text}"),
+            event=tell,
+            estimate=lambda state: devices.tell_wrench(state.wrench),
             reset_scene=context.ask if devices.simulation is None else lambda _what: False,
         )
         clock, load = devices.clock, setup.free_air_load(context.resolved)
         # without a pose in the plan the extrinsic object is not on the table
         there = context.resolved if plan.eo is not None else replace(context.resolved, extrinsic=None)
         try:
+            faults.begin()
+            arrange(context, devices, plan, trial)
             fingers = context.fingers() if controller.feedback else ()  # nobody else asks where the go is
             observer = setup.observer(there, devices, context.settings, context.believed, fingers)
-            arrange(context, devices, observer, plan, trial)
             result = Trial(name, plan, made, observer, clock, load, context.settings, watch).run()
         except SimulationDiverged as error:
             result = TrialResult("diverged", str(error), plan)
@@ -114,10 +160,10 @@ def _one_trial(
     row = _row(context, name, controller, trial, result, waypoints)
     if laws and (told := laws[-1].told()) is not None:
         row["law"] = told
-    context.results["trials"].append(row)
     end = replace(begin, status=result.status, reason=result.reason, plan=json.dumps(result.plan.to_dict()))
-    context.write(replace(end, capture_ns=context.now_ns()))
-    context.save()
+    with suppress(DriverError):  # a log that has failed ends the run after this
+        context.write(replace(end, capture_ns=context.now_ns()))
+    context.trial_done(row, finished=result.status not in CUT_OFF)
     return result
 
 
@@ -159,11 +205,14 @@ def _row(
     }
 
 
-def _calibration(module: str) -> Callable[[RunContext, Any], None]:
-    """The stage ``<module>_stage`` of ``experiments.calibrate.<module>``, imported when it runs: its fits are heavy."""
+def _lazily(module: str, name: str) -> Callable[[RunContext, Any], None]:
+    """A stage that is imported when it runs: what it needs is heavy."""
 
     def run(context: RunContext, stage: Any) -> None:
-        getattr(import_module(f"experiments.calibrate.{module}"), f"{module}_stage")(context, stage)
+        if context.resolved.experiment.rehearse:
+            context.event("warning", f"{stage.stage} touches things: it is no part of a rehearsal")
+            return
+        getattr(import_module(module), name)(context, stage)
 
     return run
 
@@ -172,16 +221,16 @@ _CALIBRATIONS = ("force_torque", "elasticity", "friction", "camera", "clock")
 
 
 def has_diverged(trials: list[dict[str, Any]]) -> bool:
-    """Whether the simulated world is nonsense by now: it has diverged in a trial, and only a reset would mend it."""
+    """Whether the simulated world has become nonsense in a trial."""
     return any(trial["status"] == "diverged" for trial in trials)
 
 
 def skip_stages(context: RunContext, stages: Sequence[Stage]) -> None:
     """Note among the results which stages do not run any more, and why: how the last trial ended.
 
-    A reset within a run would mend a diverged world, but its stamps would begin at 0 again, and the log run backwards.
+    What made the world diverge, a plan or a stiffness, would do so again.
     """
-    last = context.results["trials"][-1]
+    last = [*context.results["trials"], *context.results.get("rehearsals", ())][-1]
     reason = f"{last['name']} ended as {last['status']}"
     for stage in stages:
         name = getattr(stage, "name", None) or getattr(stage, "plan", "")
@@ -192,5 +241,6 @@ def skip_stages(context: RunContext, stages: Sequence[Stage]) -> None:
 STAGES: dict[str, Callable[[RunContext, Any], None]] = {
     "plan": plan_stage,
     "execute": execute_stage,
-    **{f"calibrate_{name}": _calibration(name) for name in _CALIBRATIONS},
+    "faults": _lazily("experiments.faults.stage", "faults_stage"),
+    **{f"calibrate_{name}": _lazily(f"experiments.calibrate.{name}", f"{name}_stage") for name in _CALIBRATIONS},
 }

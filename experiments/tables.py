@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from drivers.status import DeviceStatus
+from drivers.wire.security import WARNING_DAYS
 from experiments.paper import beside
 
 #: columns: figure and heading; the extrinsic object's only where there is one
@@ -34,7 +35,10 @@ def error_table(results: dict[str, Any]) -> Table:
         groups.setdefault((trial["skill"], trial["controller"]), []).append(trial)
         style = None if trial["status"] == "completed" else "yellow"
         _rows(table, escape(trial["name"]), trial["status"], [trial], style, figures)
-    if not results["trials"]:
+    for rehearsal in results.get("rehearsals", ()):
+        force = f"at most {rehearsal['force']:.2f} N on the object"
+        table.add_row(escape(rehearsal["name"]), rehearsal["status"], "wrist", force)
+    if not results["trials"] and not results.get("rehearsals"):
         table.add_row("no trial was run", results["status"])
     paper = beside(results["trials"])["rows"]
     several = len({skill for skill, _ in groups}) > 1
@@ -79,8 +83,34 @@ def _cell(figure: dict[str, float] | None) -> str:
     return "–" if figure is None else f"{figure['mean']:.2f} ± {figure['std']:.2f}"
 
 
-def status_table(rows: Sequence[DeviceStatus]) -> Table:
-    """One line per device."""
+def faults_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """One line per fault and moment: how it ended, how long the arm moved on, and what is not as it has to be."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for name in ("fault", "device", "moment", "ended"):
+        table.add_column(name, no_wrap=True)
+    table.add_column("moved on [ms]", justify="right")
+    table.add_column("force [N]", justify="right")
+    table.add_column("short", overflow="fold")
+    for row in rows:
+        fault = row["fault"]
+        table.add_row(
+            fault["kind"] + (f" {fault['value']:g}" if "value" in fault else ""),
+            escape(fault.get("device", "world")),
+            row["moment"],
+            row["status"],
+            "–" if row["moved_on_s"] is None else f"{row['moved_on_s'] * 1e3:.0f}",
+            "–" if row["force_N"] is None else f"{row['force_N']:.1f}",
+            escape("; ".join(row["short"])),
+            style="red" if row["short"] else None,
+        )
+    short = sum(bool(row["short"]) for row in rows)
+    table.title = f"{len(rows)} cells, {short} short\n" if short else f"{len(rows)} cells, all as expected\n"
+    table.title_justify = "left"
+    return table
+
+
+def status_table(rows: Sequence[DeviceStatus], certificates: Sequence[tuple[str, int]] = ()) -> Table:
+    """One line per device, then one per certificate, by its name and the days that it has left."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for name in ("device", "kind", "backend", "alive"):
         table.add_column(name, no_wrap=True)
@@ -99,4 +129,12 @@ def status_table(rows: Sequence[DeviceStatus]) -> Table:
             escape(row.note),
             style=None if row.alive else "red",
         )
+    table.add_section()
+    for name, days in certificates:
+        valid, soon = days >= 0, days < WARNING_DAYS
+        note = f"{days} days left" if valid else "expired"
+        if soon:
+            note += "; `extrinsic lab renew` makes a new one"
+        style = "yellow" if soon and valid else None if valid else "red"
+        table.add_row(escape(name), "certificate", "", "yes" if valid else "no", "", "", "", note, style=style)
     return table

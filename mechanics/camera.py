@@ -214,10 +214,11 @@ class CameraModel:
         if set(values) != expected:
             missing, unknown = sorted(expected - set(values)), sorted(set(values) - expected)
             raise ValueError(f"camera model: missing {missing}, unknown {unknown}")
-        return cls(
-            int(values["width"]),
-            int(values["height"]),
-            np.array(values["K"], float),
-            np.array(values["distortion"], float),
-            np.array(values["X_WC"], float),
-        )
+        width, height = values["width"], values["height"]
+        if not all(isinstance(size, int) and size < 2**31 for size in (width, height)):
+            raise ValueError(f"camera image: expected a whole number of pixels, got {width!r:.60} x {height!r:.60}")
+        try:
+            arrays = [np.array(values[name], float) for name in ("K", "distortion", "X_WC")]
+        except (TypeError, OverflowError) as error:
+            raise ValueError(f"camera model: expected numbers: {error}") from None
+        return cls(width, height, *arrays)

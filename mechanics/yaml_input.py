@@ -9,8 +9,9 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
@@ -19,6 +20,8 @@ from pydantic import BaseModel, ValidationError
 from mechanics import _yaml_reader, model_paths
 
 MAX_BYTES = 256 * 1024
+MOST = 50
+"""Faults of one file that are told at once: nobody reads more, and thousands take seconds to put into words."""
 
 M = TypeVar("M", bound=BaseModel)
 KeyPath = tuple[str | int, ...]
@@ -203,9 +206,12 @@ def parse(model: type[M], document: Document, overrides: Mapping[str, str] | Non
     try:
         return _validated(model, document.data)
     except ValidationError as e:
-        problems = [document.problem(*fault) for fault in _faults(model, document.data, e)]
-        unique = dict.fromkeys(problems)
-        raise InputError(sorted(unique, key=lambda p: (p.line is None, p.line or 0))) from None
+        found = list(islice(_faults(model, document.data, e), MOST + 1))
+        unique = dict.fromkeys(document.problem(*fault) for fault in found[:MOST])
+        problems = sorted(unique, key=lambda p: (p.line is None, p.line or 0))
+        if len(found) > MOST:
+            problems.append(Problem(document.file, None, "", "there is more that is wrong", "these put right first"))
+        raise InputError(problems) from None
 
 
 def validated(model: type[M], data: Any, at: KeyPath) -> M:
@@ -235,19 +241,17 @@ def _as_lists(data: Any) -> Any:
     return [_as_lists(value) for value in data] if isinstance(data, list | tuple) else data
 
 
-def _faults(model: Any, data: Any, error: ValidationError) -> list[tuple[KeyPath, str, str, str]]:
+def _faults(model: Any, data: Any, error: ValidationError) -> Iterator[tuple[KeyPath, str, str, str]]:
     """(path, wrong, expected, nearest) of each error, in the user's terms."""
-    out: list[tuple[KeyPath, str, str, str]] = []
     for e in error.errors(include_url=False):
         path, cut = model_paths.located(model, e["loc"], data)
         cause = e.get("ctx", {}).get("error")
         if isinstance(cause, Refusal) and cause.inner is not None:
-            out += [((*path, *cause.at, *f[0]), f[1], f[2], f[3]) for f in _faults(*cause.inner)]
+            yield from (((*path, *cause.at, *f[0]), f[1], f[2], f[3]) for f in _faults(*cause.inner))
         elif isinstance(cause, Refusal):
-            out.append(((*path, *cause.at), cause.wrong, cause.expected, cause.nearest))
+            yield (*path, *cause.at), cause.wrong, cause.expected, cause.nearest
         else:
-            out.append(_fault(model, data, path, cut, e))
-    return out
+            yield _fault(model, data, path, cut, e)
 
 
 def _fault(model: Any, data: Any, path: KeyPath, cut: bool, e: Any) -> tuple[KeyPath, str, str, str]:

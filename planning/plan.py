@@ -11,7 +11,7 @@ import numpy as np
 
 from mechanics import se2, wrench
 from mechanics.contact import gravity_wrench
-from mechanics.elasticity import Elasticity
+from mechanics.elasticity import Elasticity, check_positive_definite
 from mechanics.friction import Mode
 from mechanics.readings import Array
 
@@ -19,6 +19,7 @@ SCHEMA = 2
 
 _POSES = ("ee", "go", "eo", *(f"{part}_{body}" for part in ("preload", "unload") for body in ("ee", "go", "eo")))
 _WRENCHES = ("wrench", "preload_wrench", "unload_wrench")
+_FIGURES, _TEXTS = ("mass", "gravity", "loss", "queries", "time_s"), ("name", "skill", "planner", "status")
 _SHAPES = {
     "X_go_gocf": (3,),
     "stiffness": (3, 3),
@@ -159,7 +160,12 @@ class Plan:
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
-        """Return the plan of `to_dict`. Raises ValueError on another schema, and on keys missing or not known."""
+        """Return the plan of `to_dict`.
+
+        Raises ValueError on another schema, on keys missing or not known, and on values that are no plan's.
+        """
+        if not isinstance(plain, Mapping):
+            raise ValueError(f"plan: expected a mapping, received {type(plain).__name__}")
         schema = plain.get("schema")
         if schema != SCHEMA:
             raise ValueError(f"plan: schema: expected {SCHEMA}, received {schema!r}: plan again with this version")
@@ -168,7 +174,18 @@ class Plan:
             wrong = [f"missing {sorted(expected - received)}"] * (not expected <= received)
             wrong += [f"not known {sorted(received - expected)}"] * (not received <= expected)
             raise ValueError(f"plan: keys: {'; '.join(wrong)}")
-        return cls(**{name: plain[name] for name in expected})
+        for names, kind in ((_FIGURES, int | float), (_TEXTS, str), (("supported",), bool), (("provenance",), dict)):
+            for name in names:
+                if not isinstance(plain[name], kind) or (isinstance(plain[name], bool) and kind is not bool):
+                    raise ValueError(f"plan: {name}: expected another kind, received {plain[name]!r:.60}")
+        if not (np.isfinite(float(plain["mass"])) and np.isfinite(float(plain["gravity"])) and len(plain["ee"])):
+            raise ValueError("plan: expected a finite mass and gravity, and one step or more")
+        try:
+            plan = cls(**{name: plain[name] for name in expected})
+            check_positive_definite(plan.stiffness)
+            return plan
+        except (TypeError, AttributeError, OverflowError, RecursionError) as error:
+            raise ValueError(f"plan: values of other kinds than a plan has: {error}") from None
 
 
 def _checked(plan: str, name: str, value: object, shape: tuple[int | str, ...], sizes: dict[str, int]) -> Array:

@@ -90,6 +90,7 @@ class SimArm(Simulated[PoseReading], Arm):
 
     def begin_trial(self, rng: np.random.Generator) -> None:
         """Draw the errors of repeatability from ``rng`` from now on."""
+        super().begin_trial(rng)
         self._rng = rng
 
     def place(self, pose: Pose) -> None:

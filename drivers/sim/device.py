@@ -111,9 +111,13 @@ class Simulated(Faulty[R]):
         self._link = self._figures()
         self._guard = self._make_guard()
 
+    def begin_trial(self, rng: np.random.Generator) -> None:
+        """Draw what is lost on the way from ``rng`` from now on."""
+        self._losses = rng.spawn(1)[0]
+
     @property
     def count(self) -> int:
-        """Readings produced since the world was reset."""
+        """Readings produced since the device began its present epoch."""
         return self._sequence
 
     def sample(self) -> None:

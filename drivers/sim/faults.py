@@ -35,6 +35,7 @@ from numpy.typing import NDArray
 from drivers.errors import DeviceFault, DeviceTimeout, NotConnected, ProtocolError
 from drivers.fault import Fault
 from drivers.interfaces import Sensor, _Stamped
+from drivers.sim.mismatch import stream
 from mechanics.readings import GripperReading, PoseReading, Stamp, Status, WrenchReading
 
 R = TypeVar("R", bound=_Stamped)
@@ -64,8 +65,12 @@ class Line:
 
     def restart(self, rng: np.random.Generator) -> None:
         """No fault; chance is drawn from ``rng`` from now on."""
-        self._rng = rng
+        self.begin_trial(rng)
         self.set(())
+
+    def begin_trial(self, rng: np.random.Generator) -> None:
+        """Chance is drawn from ``rng`` from now on; what is on stays on."""
+        self._rng = rng
 
     def set(self, faults: Sequence[Fault]) -> None:
         """Let exactly these faults be on."""
@@ -141,12 +146,20 @@ class Faults:
         self.on_crash: Callable[[], None] = lambda: None
         self.next_ns = NEVER
 
-    def restart(self, faults: Iterable[Fault], seed: int, now_ns: int) -> None:
-        """Begin a new epoch with these faults alone; equal seeds have equal readings dropped and damaged."""
+    def restart(self, faults: Iterable[Fault], seed: int, now_ns: int, origin_ns: int | None = None) -> None:
+        """Begin a new epoch with these faults alone; equal seeds have equal readings dropped and damaged.
+
+        Their times count from ``origin_ns``, by default from now.
+        """
         for name, line in self._lines.items():
             line.restart(np.random.default_rng([seed, crc32(name.encode()), crc32(b"faults")]))
-        self._known = [_dated(fault, now_ns) for fault in faults]
+        self._known = [_dated(fault, now_ns if origin_ns is None else origin_ns) for fault in faults]
         self.update(now_ns)
+
+    def begin_trial(self, seed: int, *what: str | int) -> None:
+        """Draw which readings are dropped and damaged for ``what`` from now on; faults come and go as they do."""
+        for name, line in self._lines.items():
+            line.begin_trial(stream(seed, name, "faults", *what))
 
     def inject(self, fault: Fault, now_ns: int) -> None:
         """Add a fault; its times count from now."""

@@ -157,6 +157,7 @@ class SimForceTorque(Simulated[WrenchReading], ForceTorqueSensor):
 
         The zero jumps back by what it has drifted, and nobody is to take that for a fault or into a tare.
         """
+        super().begin_trial(rng)
         self._electronics.begin_trial(rng)
         self._recent.clear()
         self._guard.restart()

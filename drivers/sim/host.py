@@ -24,11 +24,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
+import numpy as np
 from pydantic import ValidationError
 
 from drivers.config import StationConfig, WorldConfig
 from drivers.errors import CommandRefused, DriverError, NotConnected
-from drivers.interfaces import Arm, ImagingSensor
+from drivers.interfaces import Arm, ForceTorqueSensor, ImagingSensor
 from drivers.scene import Scene
 from drivers.sim.faults import Faulty
 from drivers.sim.world import World
@@ -37,8 +38,9 @@ from drivers.wire.arm_server import ArmServer
 from drivers.wire.bus import Bus
 from drivers.wire.codec import encode_reading
 from drivers.wire.server import Answer, Desk, DeviceServer, Work
+from drivers.wire.station_bus import station_bus, warn_unheard
 
-PROTOCOL = 1
+PROTOCOL = 2
 TRUTH_PERIOD_NS = 20_000_000
 """Truth is published at 50 Hz of station time; in lockstep urgent work also waits no longer than this."""
 _PIECE = 0.002  # how much real time is simulated at once [s]
@@ -54,10 +56,13 @@ class Inbox:
     def __init__(self) -> None:
         self._urgent: deque[Work] = deque()
         self._queue: queue.SimpleQueue[Work | None] = queue.SimpleQueue()
+        self._owner = 0
 
     def put(self, work: Work, urgent: bool) -> None:
-        """Leave work for the owner."""
-        if urgent:
+        """Leave work for the owner, who does what is urgent at once where it comes from the owner itself."""
+        if urgent and threading.get_ident() == self._owner:
+            work()
+        elif urgent:
             self._urgent.append(work)
             self._queue.put(None)
         else:
@@ -73,7 +78,8 @@ class Inbox:
             self._urgent.popleft()()
 
     def serve(self, timeout: float) -> None:
-        """Wait for work and do one piece of it."""
+        """Wait for work and do one piece of it; who calls this is the owner."""
+        self._owner = threading.get_ident()
         self.serve_urgent()
         try:
             work = self._queue.get(timeout=timeout) if timeout > 0 else self._queue.get_nowait()
@@ -141,6 +147,7 @@ class Host:
             for verb, work in (
                 ("reset", self._reset),
                 ("advance", self._advance),
+                ("restage", self._restage),
                 ("regrasp", self._regrasp),
                 ("rearrange", self._rearrange),
                 ("clamp", self._clamp),
@@ -168,12 +175,22 @@ class Host:
         for name, device in self.world.devices.items():
             gone, server = isinstance(device, Faulty) and device.line.gone, self._servers.get(name)
             if server is None and not gone:
-                server = ArmServer(self.desk, device) if isinstance(device, Arm) else DeviceServer(self.desk, device)
+                server = self._arm_server(device) if isinstance(device, Arm) else DeviceServer(self.desk, device)
                 self._servers[name] = server
                 server.open()
             elif server is not None and gone:
                 del self._servers[name]
                 server.close()
+
+    def _arm_server(self, arm: Arm) -> ArmServer:
+        config = self.config.devices
+        known = config[arm.name]
+        sensors: dict[str, ForceTorqueSensor | float] = {
+            name: device
+            for name, device in self.world.devices.items()
+            if isinstance(device, ForceTorqueSensor) and getattr(config[name], "mount", "") == "wrist"
+        }
+        return ArmServer(self.desk, arm, getattr(known, "limits", None), sensors)
 
     def _withdraw(self) -> None:
         while self._servers:
@@ -232,25 +249,46 @@ class Host:
 
     def _reset(self, payload: bytes) -> None:
         asked = messages.decode(payload, messages.RESET)
-        for server in self._servers.values():
-            other = server.foreign_commander(asked.session) if isinstance(server, ArmServer) else None
-            if other is not None:
-                raise CommandRefused(
-                    topics.WORLD, "reset", f"{other} commands {server.device.name}", "Wait until its run has ended"
-                )
+        self._refuse_foreign("reset", asked.session)
         self.desk.restart()
         try:
             scene = Scene.model_validate_json(asked.scene)
             world = WorldConfig.model_validate_json(asked.world) if asked.world else None
-            self.world.reset(asked.seed, scene, world)
+            self.world.reset(asked.seed, scene, world, asked.begin_ns)
         except (ValidationError, ValueError) as error:
             raise CommandRefused(topics.WORLD, "reset", str(error), "Correct the scene") from error
         self.skipped_ns = 0
         self._origin_ns, self._anchor = self.world.now_ns(), time.monotonic()
-        self._truths = self._next_truth_ns = 0
-        self._staged = True
+        self._truths, self._staged = 0, True
+        self._staged_anew()
+
+    def _restage(self, payload: bytes) -> None:
+        try:
+            asked = json.loads(messages.decode(payload, messages.STRING).data)
+            scene, part, session = asked["scene"], int(asked["part"]), str(asked["session"])
+        except (ValueError, KeyError, TypeError) as error:
+            remedy = "Send JSON with scene, part and session"
+            raise CommandRefused(topics.WORLD, "restage", repr(error), remedy) from error
+        self._refuse_foreign("restage", session)
+        self.world.restage(scene, part)
+        self._staged_anew()
+
+    def _refuse_foreign(self, verb: str, session: str) -> None:
+        for server in self._servers.values():
+            other = server.foreign_commander(session) if isinstance(server, ArmServer) else None
+            if other is not None:
+                raise CommandRefused(
+                    topics.WORLD, verb, f"{other} commands {server.device.name}", "Wait until its run has ended"
+                )
+
+    def _staged_anew(self) -> None:
+        """Truth and frames are due from this instant on, and the gates begin where the arm now is."""
+        self._next_truth_ns = self.world.now_ns() - self._origin_ns
         self._due.clear()
         self._attend()
+        for server in self._servers.values():
+            if isinstance(server, ArmServer):
+                server.restart(np.array(self.world.scene.start))
         self._publish_truth()
 
     def _advance(self, payload: bytes) -> None:
@@ -302,14 +340,20 @@ class Host:
 
 
 def serve(config: StationConfig, ready: Callable[[Host], None] = lambda _: None) -> int:
-    """Serve a simulated station in this process until SIGTERM or SIGINT; returns 0. Raises NotConnected, ValueError."""
-    with Bus(
-        config.bus.endpoint, listen=True, timeout=config.bus.timeout, shared_memory=False, lease=config.lease
-    ) as bus:
+    """Serve a simulated station in this process until SIGTERM or SIGINT; returns 0.
+
+    Raises NotConnected, ValueError, and InputError where it would listen to strangers.
+    """
+    with station_bus(config, "device") as bus:
         host = Host(config, bus)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: host.stop())
-        host.run(lambda: ready(host))
+
+        def serving() -> None:
+            warn_unheard(config, [*config.devices, topics.WORLD])
+            ready(host)
+
+        host.run(serving)
     return 0
 
 

@@ -17,6 +17,7 @@ from drivers.config import StationConfig
 from drivers.errors import DriverError, NotConnected
 from drivers.sim.host import Host
 from drivers.wire.bus import Bus
+from drivers.wire.station_bus import station_bus
 
 log = logging.getLogger(__name__)
 
@@ -72,14 +73,7 @@ class HostThread(hosting.StationHost):
         config, asked = self._config, "start its simulated host"
         remedy = "Run `extrinsic serve STATION` to see what it says"
         try:
-            self._bus = Bus(
-                config.bus.endpoint,
-                listen=True,
-                timeout=config.bus.timeout,
-                shared_memory=False,
-                lease=config.lease,
-                at_once=True,
-            )
+            self._bus = station_bus(config, "device", at_once=True)
             self._thread = threading.Thread(
                 target=self._serve, args=(self._bus,), name=f"host {config.name}", daemon=True
             )
@@ -116,7 +110,10 @@ class HostThread(hosting.StationHost):
             error.got if known else str(error) or type(error).__name__,
             error.remedy if known else "",
         )
-        log.error("host: %s", self._said)
+        if isinstance(error, Crash):  # somebody wanted it
+            log.warning("host: %s", error)
+        else:
+            log.error("host: %s", self._said)
 
     def kill(self) -> None:
         """Take it off the bus at once; its thread ends with the step that it is in."""

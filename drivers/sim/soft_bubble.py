@@ -90,7 +90,7 @@ class SimSoftBubble(Faulty[ImageReading], TactileSensor):
         self._trouble: Exception | None = None
         self._rng = np.random.default_rng(0)
         self._noise: tuple[DepthNoise, NoiseSource] | None = None
-        self._sequence = 0
+        self._sequence = self._began_ns = 0
 
     def describe(self) -> Description:
         """``range`` and ``resolution`` are depths [m]; the rate is 0 (on request only) in lockstep.
@@ -134,7 +134,8 @@ class SimSoftBubble(Faulty[ImageReading], TactileSensor):
         # the camera's x is the finger's y and its y the finger's x
         depth = bubble.depth(None if outline is None else outline[:, ::-1], self._config.indentation)
         now, source = self._world.now_ns(), self._spoiler()
-        picture, status = self._developed(self._quantised(source.spoil(depth, now * 1e-9)), noisy=source.noisy)
+        at = (now - self._began_ns) * 1e-9  # of this epoch: the noise is to the last bit the same at every time of day
+        picture, status = self._developed(self._quantised(source.spoil(depth, at)), noisy=source.noisy)
         if status is Status.OK and not view.held:
             status = Status.NO_CONTACT
         stamp = Stamp(now, now, self._sequence, self.name, status)
@@ -154,7 +155,7 @@ class SimSoftBubble(Faulty[ImageReading], TactileSensor):
         if self._view is not None:
             self._view.depth(None, self._config.indentation)  # so that no frame depends on the epoch before
         self._forget()
-        self._sequence = 0
+        self._sequence, self._began_ns = 0, self._world.now_ns()
 
     def begin_trial(self, rng: np.random.Generator) -> None:
         """Noise from ``rng`` from now on, of the same camera."""

@@ -164,15 +164,16 @@ class World:
 
     # -- Simulation ----------------------------------------------------------------------------------------------
 
-    def reset(self, seed: int, scene: Scene | dict, world: WorldConfig | None = None) -> None:
+    def reset(self, seed: int, scene: Scene | dict, world: WorldConfig | None = None, begin_ns: int = 0) -> None:
         """Put ``scene`` into its initial state; ``world`` replaces profile, stiffness scale and faults.
 
         The plant differs from the scene by what the profile comes to for ``seed``; the go lies in the fingers as the
         scene says until `regrasp`.
 
         Devices stay as connected, leased and stopped as they were, the arm rests at the scene's start, tares are
-        undone, and every stream starts again at 0: its first reading comes one period later. Raises ValueError
-        (pydantic's among them) for a scene that cannot be; the world is then as it was.
+        undone, and every stream starts again at 0: its first reading comes one period later. In lockstep time starts
+        at ``begin_ns``, and faults count from 0. Raises ValueError (pydantic's among them) for a scene that cannot be;
+        the world is then as it was.
         """
         scene = scene if isinstance(scene, Scene) else Scene.model_validate(scene)
         self._need_life("reset")
@@ -185,18 +186,41 @@ class World:
         except (ValueError, DeviceFault):
             self.profile, self._stiffness_scale, self._friction_scale, self._faults, self.lab = before
             raise
-        self._plant, self.scene, self.seed = plant, scene, seed
-        self._steps = self._owed_ns = 0
-        self._origin_ns = 0 if self.lockstep else time.time_ns()
+        self.seed, self._steps = seed, 0
+        self._origin_ns = begin_ns if self.lockstep else time.time_ns()
+        self._restart(plant, scene)
+        self.faults.restart(self._faults, seed, self.now_ns(), 0 if self.lockstep else None)
+
+    def restage(self, scene: Scene | dict, part: int = 0) -> None:
+        """As `Simulation.restage`. Raises CommandRefused, and changes nothing, for a scene that cannot be."""
+        self._need_life("restage")
+        self.plant("world", "restage")
+        try:
+            scene = scene if isinstance(scene, Scene) else Scene.model_validate(scene)
+            plant = self._plant_of(scene)
+        except ValueError as error:
+            raise CommandRefused("world", "restage", str(error), "Correct the scene") from error
+        self._restart(plant, scene)
+        self._draw_afresh("part", part)
+
+    def _restart(self, plant: Plant, scene: Scene) -> None:
+        """``plant``, made of ``scene``, and every device as it is at first; time has been seen to."""
+        self._plant, self.scene, self._owed_ns = plant, scene, 0
         for name, device in self.devices.items():
-            if isinstance(device, Simulated):
+            if (restart := getattr(device, "restart", None)) is not None:
                 # a stream of its own per device: adding one leaves the others' noise as it was
-                device.restart(np.random.default_rng([seed, crc32(name.encode())]))
-            elif (restart := getattr(device, "restart", None)) is not None:
-                restart(np.random.default_rng([seed, crc32(name.encode())]))
+                restart(np.random.default_rng([self.seed, crc32(name.encode())]))
         if self._arm is not None:
             self._arm.place(scene.start)
-        self.faults.restart(self._faults, seed, self.now_ns())
+
+    def _draw_afresh(self, what: str, number: int) -> None:
+        """Noise, walks, losses and the arm's repeatability by ``what`` and ``number``, whatever was drawn before."""
+        for name, device in self.devices.items():
+            if (begin_trial := getattr(device, "begin_trial", None)) is not None:
+                # the arm's name does not count: an arm by another name has the same errors
+                own = (f"arm.{what}", number) if device is self._arm else (name, what, number)
+                begin_trial(stream(self.seed, *own))
+        self.faults.begin_trial(self.seed, what, number)
 
     def _plant_of(self, scene: Scene) -> Plant:
         fingers = self.profile.fingers
@@ -231,11 +255,7 @@ class World:
         plant = self.plant("world", "regrasp")
         if trial < 0:
             raise CommandRefused("world", "regrasp", f"trial {trial}", "Trials count from 0")
-        if self._arm is not None and self.profile.arm.repeatability.si.any():
-            self._arm.begin_trial(stream(self.seed, "arm.trial", trial))
-        for name, device in self.devices.items():
-            if device is not self._arm and (begin_trial := getattr(device, "begin_trial", None)) is not None:
-                begin_trial(stream(self.seed, name, "trial", trial))
+        self._draw_afresh("trial", trial)
         offset, fresh = self.lab.grasp_offset(trial), not plant.membrane.is_linear or min(plant.finger_limit) < inf
         if plant.held and (fresh or offset.any()):
             plant.regrasp(se2.compose(np.array(self.scene.grasp), offset), self.lab.membrane_strain(trial))

@@ -1,4 +1,4 @@
-"""An arm on the bus: the lease, the checks of every set-point, and a stop that nothing can hold up."""
+"""An arm on the bus: the lease, the gates that every set-point has to pass, and a stop that nothing can hold up."""
 
 from __future__ import annotations
 
@@ -6,16 +6,25 @@ import contextlib
 import json
 import threading
 import time
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 
-import numpy as np
-
-from drivers.errors import CommandRefused, DriverError
-from drivers.interfaces import Arm, ArmTarget
+from drivers.config import ArmLimits
+from drivers.errors import CommandRefused, DriverError, ProtocolError
+from drivers.gates import Gates
+from drivers.interfaces import Arm, ArmTarget, ForceTorqueSensor
 from drivers.wire import messages, topics
+from drivers.wire.codec import decode_reading
 from drivers.wire.lease import LeaseTable
 from drivers.wire.server import Answer, Desk, DeviceServer
+from drivers.wire.streams import Sample
+from mechanics.readings import Array, PoseReading, WrenchReading
 
+_ASKED = "command a set-point"
 _TICK = 0.05
+#: what a network delays is not lost yet [s]; in lockstep nothing is on its way while time passes
+_PATIENCE = 0.02
 
 
 class ArmServer(DeviceServer):
@@ -24,22 +33,65 @@ class ArmServer(DeviceServer):
     A commander holds the lease by a liveliness token (lost at once when its process dies) and by renewal (lost after
     a second when it is frozen; later in lockstep, where nothing moves meanwhile). Losing it holds the arm. Stop and
     hold need no lease, have queryables of their own and overtake everything that waits.
+
+    ``sensors`` are the force/torque sensors that the arm carries: by name, the device itself where it is in this
+    process, else the rate [Hz] at which it speaks on the bus. They and the estimator's wrench, where somebody
+    publishes one, are the witnesses of the arm's `Gates`.
     """
 
-    def __init__(self, desk: Desk, arm: Arm):
+    def __init__(
+        self,
+        desk: Desk,
+        arm: Arm,
+        limits: ArmLimits | None = None,
+        sensors: Mapping[str, ForceTorqueSensor | float] | None = None,
+    ):
         super().__init__(desk, arm)
-        self.arm = arm
+        self.arm, self._sensors = arm, dict(sensors or {})
+        rates = {name: s if isinstance(s, int | float) else s.describe().rate for name, s in self._sensors.items()}
+        self.gates = Gates(
+            arm.name,
+            limits or ArmLimits(),
+            {**{name: 1.0 / rate for name, rate in rates.items()}, topics.ESTIMATOR: None},
+            0.0 if desk.lockstep else _PATIENCE,
+            arm.reachable,
+        )
         self._table = LeaseTable(desk.lease)
         self._lock = threading.Lock()
         self._served: str | None = None  # for whom the arm's own lease is held; only the owner's thread touches it
-        self._sequence = -1
         self._closing = threading.Event()
         self._watchman = threading.Thread(target=self._watch, name=f"{arm.name} lease", daemon=True)
 
     def open(self) -> None:
-        """As `DeviceServer.open`, and watch over the lease."""
+        """As `DeviceServer.open`, and watch over lease, commander and force."""
         super().open()
+        self.gates.restart(self.desk.now_ns())
+        with contextlib.suppress(DriverError):  # it has told nothing yet, and will
+            self.gates.at(self.arm.latest(0.1).pose)
+        self._stops.append(self.arm.listen(self._moved))
+        for name, sensor in self._sensors.items():
+            if isinstance(sensor, int | float):
+                self._hear(name)
+            else:
+                self._stops.append(sensor.listen(partial(self._felt, name)))
+        self._hear(topics.ESTIMATOR)
         self._watchman.start()
+
+    def restart(self, pose: Array) -> None:
+        """A simulated world was reset, with the arm at ``pose``: the gates begin anew."""
+        self.gates.restart(self.desk.now_ns(), pose)
+
+    def _hear(self, source: str) -> None:
+        """Listen to a witness of force on the bus."""
+
+        def receive(sample: Sample) -> None:
+            with contextlib.suppress(ProtocolError):  # what cannot be read says nothing
+                reading = decode_reading(messages.WRENCH, sample.payload, sample.sequence, sample.status, 0)
+                if isinstance(reading, WrenchReading):
+                    self._felt(source, reading)
+
+        key = topics.key(self.desk.station, source, next(iter(topics.STREAMS["force_torque"])))
+        self._stops.append(self.desk.bus.subscribe(key).listen(receive))
 
     def close(self) -> None:
         """Stop watching, hold the arm, withdraw; idempotent."""
@@ -64,9 +116,10 @@ class ArmServer(DeviceServer):
         self._serve("release", self._release)
         self._serve("renew", self._renew, direct=True)
         self._serve("holders", self._holders, direct=True)
-        self._serve("hold", lambda _: self.arm.hold(), urgent=True)
-        self._serve("stop", lambda _: self.arm.stop(), urgent=True)
-        self._serve("recover", lambda _: self.arm.recover(), urgent=True)
+        self._serve("hold", lambda _: self._hold(), urgent=True)
+        self._serve("stop", lambda payload: self._stop(_reason(payload)), urgent=True)
+        self._serve("recover", lambda _: self._recover(), urgent=True)
+        self._serve("safety", lambda _: Answer(json.dumps(self.gates.summary())), direct=True)
         pattern = topics.lease(self.desk.station, self.arm.name, "*")
         self._stops.append(self.desk.bus.watch_all(pattern, self._token_gone))
 
@@ -86,7 +139,9 @@ class ArmServer(DeviceServer):
             with self._lock:
                 self._table.release(holder)
             raise
-        self._served, self._sequence = holder, -1
+        self._served = holder
+        self.gates.begin()
+        self._tell()
         return Answer()
 
     def _renew(self, payload: bytes) -> None:
@@ -108,32 +163,40 @@ class ArmServer(DeviceServer):
             self._give_back()
 
     def _command(self, payload: bytes) -> None:
-        asked = "command a set-point"
         value = messages.decode(payload, messages.TARGET)
+        target = ArmTarget(value.pose.copy(), value.twist.copy(), value.duration, value.sequence)
+        try:
+            with self.gates.counting("lease"):
+                self._need_lease(value.holder)
+            with self.gates.counting("stopped"):
+                self._need_motion()
+            self.gates.admit(target, messages.stamp_ns(value.header.stamp), self.desk.now_ns())
+            with self.gates.counting("arm"):
+                self.arm.command(target)
+        except DriverError:
+            self._tell()
+            raise
+        self.gates.accept(target, self.desk.now_ns())
+        stream = self._streams["target"]
+        if stream.matched:  # the holder's full name would let others command in it
+            told = replace(value, holder=nickname(value.holder))
+            stream.put(messages.encode(told), stream.newest + 1, self.desk.now_ns())
+
+    def _need_lease(self, holder: str) -> None:
         with self._lock:
             now = time.monotonic()
-            if not self._table.renew(value.holder, now):
-                if self._table.has_lapsed(value.holder, now):
-                    silent = f"its lease lapsed: nothing was heard of it for {self._table.time_to_live:g} s"
-                    raise CommandRefused(
-                        self.arm.name, asked, silent, "See what held it up, and acquire the lease anew"
-                    )
-                raise CommandRefused(self.arm.name, asked, "no lease", "Acquire the lease: `with arm.lease(name):`")
-        numbers = (*value.pose, *value.twist, value.duration)
-        if not np.all(np.isfinite(numbers)) or value.duration < 0:
-            raise CommandRefused(self.arm.name, asked, "the target is not finite", "Send finite numbers")
-        if value.sequence <= self._sequence:
-            raise CommandRefused(
-                self.arm.name,
-                asked,
-                f"target {value.sequence} came after {self._sequence}",
-                "Count targets up within a lease",
-            )
-        self.arm.command(ArmTarget(value.pose.copy(), value.twist.copy(), value.duration, value.sequence))
-        self._sequence = value.sequence
-        stream = self._streams["target"]
-        if stream.matched:
-            stream.put(payload, stream.newest + 1, self.desk.now_ns())
+            if self._table.renew(holder, now):
+                return
+            lapsed = self._table.has_lapsed(holder, now)
+        if lapsed:
+            silent = f"its lease lapsed: nothing was heard of it for {self._table.time_to_live:g} s"
+            raise CommandRefused(self.arm.name, _ASKED, silent, "See what held it up, and acquire the lease anew")
+        raise CommandRefused(self.arm.name, _ASKED, "no lease", "Acquire the lease: `with arm.lease(name):`")
+
+    def _need_motion(self) -> None:
+        if self.gates.stopped:
+            why = f"the arm is stopped: {self.gates.stopped}"
+            raise CommandRefused(self.arm.name, _ASKED, why, "See why, then recover it: `extrinsic recover STATION`")
 
     def _token_gone(self, token: str) -> None:
         holder = topics.holder_of(token)
@@ -148,6 +211,8 @@ class ArmServer(DeviceServer):
                 lost = self._table.lapse(time.monotonic())
             if lost is not None:
                 self.desk.run(lambda holder=lost: self._lose(holder), True)
+            if not self.desk.lockstep:  # there every reading of the pose looks, so that time decides and not luck
+                self._guard()
 
     def _lose(self, holder: str) -> None:
         if self._served == holder:
@@ -157,6 +222,73 @@ class ArmServer(DeviceServer):
         if self._served is not None:
             self._served = None
             self.arm.release()  # holds the arm
+            self.gates.rested()
+
+    # -- safety --------------------------------------------------------------------------------------------------
+
+    def _moved(self, reading: PoseReading) -> None:
+        self.gates.at(reading.pose)
+        self._guard()
+
+    def _felt(self, source: str, reading: WrenchReading) -> None:
+        reason = self.gates.feel(source, reading, self.desk.now_ns())
+        if reason:
+            self.desk.run(lambda: self._stop(reason), True)
+
+    def _guard(self) -> None:
+        """Do what the watchdogs ask for."""
+        match self.gates.watch(self.desk.now_ns()):
+            case "hold":
+                self.desk.run(self._halt, True)
+            case "stop":
+                self.desk.run(lambda: self._stop(self.gates.stopped), True)
+
+    def _halt(self) -> None:
+        self.arm.hold()
+        self._tell()
+
+    def _hold(self) -> None:
+        self.arm.hold()
+        self.gates.rested()
+
+    def _stop(self, reason: str) -> None:
+        self.gates.stop(reason)
+        self.arm.stop()
+        self._tell()
+
+    def _recover(self) -> None:
+        self.arm.recover()
+        self.gates.recover()
+        self._tell()
+
+    def _tell(self) -> None:
+        """Publish how the gates stand; in the owner's thread."""
+        stream = self._streams["safety"]
+        if stream.matched:
+            now_ns = self.desk.now_ns()
+            stream.put(messages.encode(_diagnostics(self.arm.name, self.gates, now_ns)), stream.newest + 1, now_ns)
+
+
+def _reason(payload: bytes) -> str:
+    """Who asked for a stop, and why, where they say so."""
+    said = messages.decode(payload, messages.STRING).data if payload else ""
+    return said or "somebody asked for it"
+
+
+def _diagnostics(name: str, gates: Gates, now_ns: int) -> object:
+    """The gates' summary as ROS diagnostics: an error while stopped, a warning while something is refused or held."""
+    found = gates.summary()
+    level, said = 0, "ok"
+    if found["stopped"]:
+        level, said = 2, f"stopped: {found['stopped']}"
+    elif found["held"] or found["refusal"]:
+        level, said = 1, found["held"] or found["refusal"]
+    counts = {"accepted": found["accepted"], **{f"refused by {gate}": n for gate, n in found["refused"].items()}}
+    values = [messages.message("diagnostic_msgs/msg/KeyValue", key=k, value=str(v)) for k, v in counts.items()]
+    status = messages.message(
+        "diagnostic_msgs/msg/DiagnosticStatus", level=level, name=name, message=said, hardware_id=name, values=values
+    )
+    return messages.message(messages.DIAGNOSTICS, header=messages.header(now_ns, "world"), status=[status])
 
 
 def nickname(holder: str) -> str:

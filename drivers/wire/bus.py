@@ -6,7 +6,6 @@ this room only append or set a flag, because a slow one starves the whole sessio
 
 from __future__ import annotations
 
-import json
 import queue
 import threading
 import time
@@ -17,8 +16,10 @@ from typing import Literal, Self
 
 import zenoh
 
-from drivers.errors import DeviceFault, DeviceTimeout, NotConnected
+from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.wire import topics
+from drivers.wire.security import Identity
+from drivers.wire.session import open_session
 from drivers.wire.streams import Publisher, Subscription
 from drivers.wire.watch import Watch, undeclare, wait_matching
 
@@ -52,10 +53,10 @@ class Query:
 class Bus:
     """A zenoh session as a context manager. ``endpoint`` is listened at (``listen``) or connected to.
 
-    ``mode``: ``peer`` on one machine, ``client`` toward a router. ``lease`` [s] is how long a peer may be silent, or
-    not take what it is sent, before it counts as dead; zenoh's own ten seconds are too many beside an arm. ``at_once``
-    is for a session that both ends of a stream share: who publishes delivers, too, in its own thread. Raises
-    NotConnected when the session cannot be opened within ``timeout`` seconds.
+    ``mode``: ``peer`` on one machine, ``client`` toward a router, to whom an ``identity`` shows its certificate.
+    ``lease`` [s] is how long a peer may be silent, or not take what it is sent, before it counts as dead; zenoh's own
+    ten seconds are too many beside an arm. ``at_once`` is for a session that both ends of a stream share: who publishes
+    delivers, too, in its own thread. Raises NotConnected when the session cannot be opened within ``timeout`` seconds.
     """
 
     def __init__(
@@ -68,41 +69,24 @@ class Bus:
         shared_memory: bool = True,
         lease: float = 1.0,
         at_once: bool = False,
+        identity: Identity | None = None,
     ):
-        self.endpoint, self.timeout = endpoint, timeout
+        self.endpoint, self.timeout, self.identity = endpoint, timeout, identity
         self._at_once = at_once
         self._subscriptions: dict[str, Subscription] = {}
         self._queriers: dict[str, zenoh.Querier] = {}
         self._tokens: set[zenoh.LivelinessToken] = set()
         self._lock = threading.Lock()
         self._closed = False
-        settings = {
-            "mode": mode,
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": False,
-            "listen/endpoints": [endpoint] if listen else [],
-            "listen/exit_on_failure": True,
-            "connect/endpoints": [] if listen else [endpoint],
-            "connect/timeout_ms": int(timeout * 1000),
-            "connect/exit_on_failure": True,
-            "transport/unicast/open_timeout": int(2 * lease * 1000),
-            "transport/link/tx/lease": int(lease * 1000),
-            "transport/link/tx/queue/congestion_control/block/wait_before_close": int(lease * 1e6),
-            "transport/shared_memory/enabled": shared_memory,
-        }
-        config = zenoh.Config()
-        for path, value in settings.items():
-            config.insert_json5(path, json.dumps(value))
-        try:
-            self.session = zenoh.open(config)
-        except zenoh.ZError as error:
-            doing = "listen at" if listen else "connect to"
-            raise NotConnected(
-                "bus",
-                f"{doing} {endpoint}",
-                str(error).split("at /")[0].strip(),
-                "Check bus.endpoint of the station file; another program may have the port",
-            ) from error
+        self.session = open_session(
+            mode,
+            endpoint,
+            listen=listen,
+            timeout=timeout,
+            lease=lease,
+            identity=identity,
+            settings={"transport/shared_memory/enabled": shared_memory},
+        )
         self.zid = str(self.session.zid())
         _open.add(self)
 
@@ -215,7 +199,7 @@ class Bus:
             if not wait_matching(querier, deadline, watch=watch):
                 if watch is not None and watch.gone:
                     raise dead
-                raise DeviceTimeout(device, asked, f"nobody serves {key}", "Check `extrinsic status STATION`")
+                raise DeviceTimeout(device, asked, f"nobody serves {key}", self._unserved())
             handler = zenoh.handlers.Callback(answers.put, lambda: answers.put("end"), indirect=False)
             querier.get(handler, payload=payload)
             answer = answers.get(timeout=max(deadline - time.monotonic(), 0.0))
@@ -236,6 +220,10 @@ class Bus:
         if answer == "dead" or (watch is not None and watch.wait(_VERDICT)):
             raise dead
         raise DeviceFault(device, asked, "an empty answer", "The server failed while it worked; read its log")
+
+    def _unserved(self) -> str:
+        remedy = "Check `extrinsic status STATION`"
+        return remedy if self.identity is None else f"{remedy}, and whether {self.identity.name} may ask for this"
 
     def _querier(self, key: str) -> zenoh.Querier:
         with self._lock:

@@ -12,9 +12,9 @@ import numpy as np
 from drivers.errors import DeviceFault
 from drivers.fault import Fault
 from drivers.wire import messages, topics
-from drivers.wire.client import RemoteSensor
 from drivers.wire.codec import decode_reading
 from drivers.wire.link import Link
+from drivers.wire.remote import RemoteSensor
 from drivers.wire.watch import Watch
 from mechanics.readings import Array, TruthReading
 
@@ -56,15 +56,13 @@ class RemoteSimulation:
     def __init__(self, link: Link, watch: Watch, sensors: Sequence[RemoteSensor]):
         self._link, self._watch, self._sensors = link, watch, tuple(sensors)
 
-    def reset(self, seed: int, scene: dict, world: dict | None = None) -> None:
+    def reset(self, seed: int, scene: dict, world: dict | None = None, begin_ns: int = 0) -> None:
         """As `Simulation.reset`; ``world`` (a `drivers.config.WorldConfig` as a dict) replaces the present one's.
 
-        Raises CommandRefused while another session commands the arm, and for a scene that cannot be.
+        In lockstep time starts at ``begin_ns``. Raises CommandRefused while another session commands the arm, and for a
+        scene that cannot be.
         """
-        for subscription in self._link.bus.subscriptions():
-            subscription.rewind()
-        for sensor in self._sensors:
-            sensor.forget()
+        self._forget()
         payload = messages.encode(
             messages.message(
                 messages.RESET,
@@ -72,10 +70,23 @@ class RemoteSimulation:
                 scene=json.dumps(scene),
                 world="" if world is None else json.dumps(world),
                 session=self._link.bus.zid,
+                begin_ns=begin_ns,
             )
         )
         reply = self._link.ask(topics.WORLD, "reset", payload, watch=self._watch)
         self._link.now_ns = reply.now_ns
+
+    def restage(self, scene: dict, part: int = 0) -> None:
+        """As `Simulation.restage`. Raises CommandRefused while another session commands the arm, too."""
+        self._forget()
+        self._tell("restage", json.dumps({"scene": scene, "part": part, "session": self._link.bus.zid}))
+
+    def _forget(self) -> None:
+        """What was received is of another epoch, and streams will count from 0."""
+        for subscription in self._link.bus.subscriptions():
+            subscription.rewind()
+        for sensor in self._sensors:
+            sensor.forget()
 
     def regrasp(self, trial: int) -> None:
         """As `Simulation.regrasp`. Raises DeviceFault while there is no scene, CommandRefused where it cannot be."""

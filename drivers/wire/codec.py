@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from drivers.errors import ProtocolError
-from drivers.wire import messages
+from drivers.wire import messages, pictures
 from drivers.wire.messages import NANOSECONDS
 from mechanics.readings import (
     Array,
@@ -111,6 +111,7 @@ def _stamped(header: Any, stamp: Stamper) -> Stamp:
 # Poses and wrenches: encapsulation, seconds, nanoseconds, length of the frame's name; the name; aligned doubles.
 _HEAD = struct.Struct("<4siII")
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+_NAME = 256  # bytes of a frame's name that is worth keeping; longer ones take the general path
 
 
 @lru_cache(maxsize=256)
@@ -137,7 +138,7 @@ def _pack(capture_ns: int, frame: str, values: Any) -> bytes:
 def _unpack(payload: bytes, type_name: str, stamp: Stamper, values: int) -> tuple[Stamp, tuple[float, ...]]:
     if len(payload) >= _HEAD.size and payload[:4] == _LITTLE_ENDIAN:
         size = _HEAD.unpack_from(payload)[3]
-        if 0 < size <= len(payload):
+        if 0 < size <= _NAME:
             layout = _layout(size, values)
             if layout.size == len(payload):
                 _, seconds, nanoseconds, _, name, *numbers = layout.unpack(payload)
@@ -274,8 +275,12 @@ def _decode_compressed(payload: bytes, type_name: str, stamp: Stamper) -> ImageR
     value = messages.decode(payload, type_name)
     encoding = value.format.split(";")[0].strip()
     dtype, channels = _pixels(encoding, type_name)
+    size = pictures.pixels(value.data.tobytes())
+    if size is None or not 0 < size <= pictures.MOST:
+        said = "no PNG and no baseline JPEG" if size is None else f"a picture of {size} pixels"
+        raise ProtocolError("wire", f"read {type_name}", said, f"At most {pictures.MOST} are read")
     try:
-        image = cv2.imdecode(value.data, cv2.IMREAD_UNCHANGED) if value.data.size else None
+        image = cv2.imdecode(value.data, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ProtocolError("wire", f"read {type_name}", f"a damaged picture: {error}", "") from error
     if image is None or image.dtype != dtype or image.ndim != (3 if channels > 1 else 2):

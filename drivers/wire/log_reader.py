@@ -2,30 +2,21 @@
 
 from __future__ import annotations
 
-import struct
+import zlib
 from collections.abc import Collection, Iterator
-from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile, InvalidMagic, McapError
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, get_chunk_data_stream
+from mcap.records import Attachment, Channel, DataEnd, Footer, McapRecord, Message, Schema, Statistics
 
 from drivers.errors import ProtocolError
-from drivers.wire import messages
+from drivers.wire import log_records, messages
 from drivers.wire.codec import TYPES, Reading, decode_reading
+from drivers.wire.log_records import MAGIC, Broken
 from drivers.wire.records import STREAMS, Record, decode_record
 
 _READINGS = {*TYPES.values(), messages.COMPRESSED_IMAGE}
 _RECORDS = {type_name for _, type_name in STREAMS.values()}
-_LARGEST = 2**30
-# of an MCAP record: opcode and length; of a message: channel, sequence, time of logging, time of publishing
-_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
-_BROKEN = (McapError, struct.error, zstandard.ZstdError, UnicodeDecodeError, MemoryError, OverflowError)
 
 
 class Logged(NamedTuple):
@@ -45,18 +36,30 @@ class Logged(NamedTuple):
         return decode_reading(self.type_name, self.payload, self.sequence, receive_ns=self.log_ns)
 
 
+class Break(NamedTuple):
+    """A stretch of a file that is lost: its bytes ``at`` to ``until``, and why."""
+
+    at: int
+    until: int
+    why: str
+
+
 class LogReader:
     """A log file. After an iteration ``ending`` is ``complete``, or says where and why the file broke off.
 
-    Raises ProtocolError for a file that is no MCAP, OSError for one that cannot be read.
+    With ``salvage`` it goes on behind damage, at the next chunk whose check sum is right; ``breaks`` are the stretches
+    that are lost. A chunk that the file ends within is one: nothing vouches for a part of it. Raises ProtocolError for
+    a file that is no MCAP, OSError for one that cannot be read.
     """
 
-    def __init__(self, path: Path | str):
+    def __init__(self, path: Path | str, *, salvage: bool = False):
         self.path = Path(path)
         self.ending = "not read yet"
+        self.breaks: list[Break] = []
+        self._salvage = salvage
         with self.path.open("rb") as file:
-            magic = file.read(8)
-        if magic != b"\x89MCAP0\r\n":
+            magic = file.read(len(MAGIC))
+        if magic != MAGIC:
             raise ProtocolError("log", f"read {self.path}", "no MCAP file", "Give a log.mcap of a run folder")
 
     @property
@@ -68,7 +71,7 @@ class LogReader:
         """Messages in the order of the file, of all topics or those given."""
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
-        for record in self._records():
+        for record in self.records():
             if isinstance(record, Message):
                 channel = channels.get(record.channel_id)
                 if channel is None or (topics is not None and channel.topic not in topics):
@@ -95,7 +98,7 @@ class LogReader:
 
     def attachments(self) -> dict[str, bytes]:
         """The files in the log, by name."""
-        return {record.name: record.data for record in self._records() if isinstance(record, Attachment)}
+        return {record.name: record.data for record in self.records() if isinstance(record, Attachment)}
 
     def counts(self) -> dict[str, int]:
         """Messages per topic."""
@@ -104,54 +107,50 @@ class LogReader:
             counts[logged.topic] = counts.get(logged.topic, 0) + 1
         return counts
 
-    def _records(self) -> Iterator[McapRecord]:
-        self.ending = "not read to its end"
-        closed = False
+    def records(self) -> Iterator[McapRecord]:
+        """The records of the file, those within chunks among them, without indexes."""
+        self.ending, self.breaks = "not read to its end", []
         with self.path.open("rb") as file:
-            try:
-                reader = StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST)
-                for record in reader.records:
-                    closed = closed or isinstance(record, Footer)
-                    if isinstance(record, Chunk):
-                        yield from _within(record)
-                    else:
-                        yield record
-            except InvalidMagic:
-                self.ending = f"torn at byte {file.tell()}: the end is missing"
-            except CRCValidationError as error:
-                self.ending = f"damaged before byte {file.tell()}: {error}"
-            except (
-                McapError,
-                struct.error,
-                zstandard.ZstdError,
-                UnicodeDecodeError,
-                MemoryError,
-                OverflowError,
-            ) as error:
-                self.ending = f"torn at byte {file.tell()}: {str(error) or 'the file ends within a record'}"
-            else:
-                self.ending = "complete" if closed else f"torn at byte {file.tell()}: no footer"
+            size = file.seek(0, 2)
+            at: int | None = len(MAGIC)
+            while at is not None:
+                try:
+                    yield from self._run(file, at, size)
+                    at = None
+                except Broken as broken:
+                    if not self.breaks:
+                        self.ending = f"{'torn' if broken.torn else 'damaged'} at byte {broken.at}: {broken.why}"
+                    at = yield from self._behind(file, broken, size)
+        if not self.breaks:
+            self.ending = "complete"
 
+    def _run(self, file: BinaryIO, at: int, size: int) -> Iterator[McapRecord]:
+        """The records from byte ``at`` to the footer. Raises Broken."""
+        crc = zlib.crc32(MAGIC) if at == len(MAGIC) else None
+        count = 0
+        while True:
+            record = log_records.record_at(file, at, size)
+            for part in log_records.parsed(record):
+                if isinstance(part, DataEnd) and crc is not None and part.data_section_crc not in (0, crc):
+                    raise Broken(at, "the check sum of the file is wrong")
+                if isinstance(part, Message):
+                    count += 1
+                elif isinstance(part, Statistics) and crc is not None and part.message_count != count:
+                    raise Broken(at, f"{count} messages, where {part.message_count} were written")
+                yield part
+                if isinstance(part, Footer):
+                    if file.read(len(MAGIC) + 1) != MAGIC:
+                        raise Broken(record.end, "the end is missing", torn=True)
+                    return
+            crc = None if crc is None else record.crc(crc)
+            at = record.end
 
-def _within(chunk: Chunk) -> list[McapRecord]:
-    """What is in a chunk, all of it or nothing. A log is a hundred thousand small messages: the library takes its time.
-
-    Raises what the library does for a chunk that is damaged.
-    """
-    stream, size = get_chunk_data_stream(chunk, validate_crc=True)
-    data, at = stream.read(size), 0
-    records: list[McapRecord] = []
-    while at < size:
-        opcode, length = _RECORD.unpack_from(data, at)
-        begin, at = at + _RECORD.size, at + _RECORD.size + length
-        if at > size:
-            raise EndOfFile
-        if opcode == Opcode.MESSAGE:
-            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, begin)
-            payload = data[begin + _MESSAGE.size : at]
-            records.append(Message(channel, log_time, payload, publish_time, sequence))
-        elif opcode == Opcode.CHANNEL:
-            records.append(Channel.read(ReadDataStream(BytesIO(data[begin:at]))))
-        elif opcode == Opcode.SCHEMA:
-            records.append(Schema.read(ReadDataStream(BytesIO(data[begin:at]))))
-    return records
+    def _behind(self, file: BinaryIO, broken: Broken, size: int) -> Iterator[McapRecord]:
+        """What the end of the file says of topics; returns where reading goes on, None where nothing follows."""
+        following: int | None = None
+        if self._salvage:
+            following = log_records.next_chunk(file, broken.at, size)
+            if following is not None:
+                yield from log_records.definitions(file, size)
+        self.breaks.append(Break(broken.at, size if following is None else following, broken.why))
+        return following

@@ -8,11 +8,14 @@ from __future__ import annotations
 from drivers.config import StationConfig
 from drivers.wire import messages
 
+ESTIMATOR = "estimator"
+"""Whoever estimates from the fingers; its wrench, where it publishes one, is a second witness of the arm's gates."""
+
 WORLD = "world"
 """The pseudo-device that stands for the station itself: its description, its clock and, in simulation, its truth."""
 
 STREAMS: dict[str, dict[str, str]] = {
-    "arm": {"pose": messages.POSE, "target": messages.TARGET},
+    "arm": {"pose": messages.POSE, "target": messages.TARGET, "safety": messages.DIAGNOSTICS},
     "gripper": {"state": messages.GRIPPER},
     "force_torque": {"wrench": messages.WRENCH},
     "tag_camera": {"detections": messages.DETECTIONS, "image": messages.COMPRESSED_IMAGE},

@@ -111,7 +111,7 @@ def _lens(rig: Rig, stage: CameraStage, start: CameraModel, rng: np.random.Gener
         for number, pose in enumerate(board_poses(start, distance, stage.views, rng), 1):
             rig.show_board(BOARD, pose, f"Hold the tag board before the camera, pose {number} of {stage.views}, tilted")
             views.append(_averaged(rig, stage.frames))
-            context.check_interrupt()
+            context.heed()
             advance()
     rig.put_board_away()
     with context.progress.step("fit the lens"), one_thread():

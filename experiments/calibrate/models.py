@@ -70,6 +70,17 @@ class _Calibration(_Model):
         """The file's name without its ending."""
         return self.kind
 
+    @model_validator(mode="after")
+    def _can_be_filed(self) -> Self:
+        try:
+            name = self.name
+        except (KeyError, IndexError):
+            wrong, expected = "does not say of which objects it is", "the name and shape of each by its role (go, eo)"
+            raise Refusal(wrong, expected, at=("origin", "objects")) from None
+        if "/" in name or not name.isprintable() or len(name) > 200:
+            raise Refusal(f"{name!r:.60} can be no file's name", "names of objects and sensors")
+        return self
+
 
 class ElasticityCalibration(_Calibration):
     """The stiffness of a pair of fingers: w = K x, K in gocf (Tactile Elasticity Characterization).

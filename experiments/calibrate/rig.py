@@ -154,6 +154,7 @@ def at_hand(context: RunContext, what: str) -> Iterator[Rig]:
     devices = context.devices()
     with devices.arm.lease(context.holder), context.timed(devices):
         context.event("info", f"calibrate {what}")
+        context.begin(setup.scene(context.resolved), part=1 + context.results["progress"]["stage"])
         observer = setup.observer(context.resolved, devices, context.settings, context.believed)
         settings = context.settings
         mover = Mover(
@@ -162,6 +163,6 @@ def at_hand(context: RunContext, what: str) -> Iterator[Rig]:
             settings.control_rate,
             observer.arm_pose(),
             settings.approach_speed,
-            context.check_interrupt,
+            context.heed,
         )
         yield Rig(context, devices, observer, mover)

@@ -8,6 +8,7 @@ stands under its name; those before it are kept beside it under the time they we
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -66,6 +67,15 @@ class Calibrations:
     def told(self) -> dict[str, dict[str, Any]]:
         """Each calibration as results.json has it: its file, and all that the file says."""
         return {name: {"file": str(self.files[name]), **c.model_dump(mode="json")} for name, c in self.known.items()}
+
+    @classmethod
+    def of_told(cls, told: Mapping[str, Mapping[str, Any]]) -> Calibrations:
+        """Those that `told` has put into results.json. Raises ValueError (pydantic's) for what it has not."""
+        known = cls()
+        for said in told.values():
+            figures = {key: value for key, value in said.items() if key != "file"}
+            known.add(_KINDS[said["kind"]].model_validate_json(json.dumps(figures)), Path(said["file"]))
+        return known
 
     def of(self, kind: type, name: str | None = None) -> Any:
         """The calibration ``name`` (by default its kind's name) if it is known and of ``kind``, else None."""
@@ -159,8 +169,8 @@ def read(file: Path) -> Calibration:
     """One calibration file. Raises InputError."""
     document = read_yaml(file)
     kind = document.data.get("kind")
-    if kind not in _KINDS:
-        raise InputError([document.problem(("kind",), f"{kind!r} is no kind of calibration", ", ".join(_KINDS))])
+    if not isinstance(kind, str) or kind not in _KINDS:
+        raise InputError([document.problem(("kind",), f"{kind!r:.60} is no kind of calibration", ", ".join(_KINDS))])
     return parse(_KINDS[kind], document)
 
 

@@ -8,10 +8,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, Field
+
 from experiments.calibrate import store
 from experiments.campaign.jobs import Job, digest, planned_trials
 from experiments.files import Resolved, dump_resolved, load
 from experiments.planning.files import plan_files
+from experiments.results_file import Planned, Results, Word, read_json
 from experiments.run_folder import write_atomic, write_json
 from experiments.schema import ExecuteStage
 from mechanics.yaml_input import InputError, Problem
@@ -61,7 +64,10 @@ class JobFolder:
     @property
     def failure(self) -> str | None:
         """Why the job was given up, if it was."""
-        return json.loads(self._failure.read_text())["reason"] if self._failure.is_file() else None
+        if not self._failure.is_file():
+            return None
+        told = read_json(self._failure, _Failure)
+        return "given up, nobody can read why" if told is None else told["reason"]
 
     def give_up(self, reason: str) -> None:
         """Note why no more attempt is made."""
@@ -73,10 +79,22 @@ class JobFolder:
 
 
 def _results(run: Path) -> dict[str, Any] | None:
-    try:
-        return json.loads((run / "results.json").read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
+    """The results of a run; None where there are none that anybody can read: then it has not come to its end."""
+    return read_json(run / "results.json", Results)
+
+
+class _Failure(BaseModel):
+    reason: str
+
+
+class _Job(BaseModel):
+    id: str = Field(pattern=r"^[^/\\\x00.][^/\\\x00]{0,199}$")
+    tags: dict[Word, str | int | float | bool | None]
+    trials: list[Planned]
+
+
+class _Campaign(BaseModel):
+    jobs: list[_Job]
 
 
 class CampaignFolder:
@@ -94,7 +112,10 @@ class CampaignFolder:
         """What campaign.json says. Raises InputError where there is none."""
         if not self.campaign.is_file():
             raise InputError([Problem(str(self.path), None, "", "no campaign.json in it", "a sweep's folder")])
-        return json.loads(self.campaign.read_text(encoding="utf-8"))
+        found = read_json(self.campaign, _Campaign)
+        if found is None:
+            raise InputError([Problem(str(self.campaign), None, "", "no campaign can be read in it", "a sweep's own")])
+        return found
 
     def agree(self, jobs: Sequence[Job], resolved: Mapping[str, Resolved]) -> dict[str, Any]:
         """What campaign.json says of these jobs, now or once `keep` has written it.
@@ -198,7 +219,7 @@ def _difference(there: Sequence[Mapping[str, Any]], asked: Sequence[Mapping[str,
             return f"it has no job {id}"
         if known[id]["tags"] != job["tags"]:
             return f"its job {id} is {known[id]['tags']}, not {job['tags']}"
-        if known[id]["resolved"] != job["resolved"]:
+        if known[id].get("resolved") != job["resolved"]:
             return f"its job {id} has another experiment or station (jobs/{id}/experiment.yaml)"
     more = [id for id in known if id not in wanted]
     return f"it has a job {more[0]}, too" if more else ""

@@ -136,10 +136,9 @@ def _host(resolved: Resolved) -> Hosting:
 
 def _on_its_own(resolved: Resolved) -> Resolved:
     """A simulated station at an endpoint that nobody else uses; a laboratory's is where it is."""
-    from experiments.ports import free_endpoint
+    from experiments.ports import own_bus
 
     station = resolved.station
     if station.world is None or any(device.backend != "sim" for device in station.devices.values()):
         return resolved
-    bus = station.bus.model_copy(update={"endpoint": free_endpoint()})
-    return replace(resolved, station=station.model_copy(update={"bus": bus}))
+    return replace(resolved, station=station.model_copy(update={"bus": own_bus(station.bus)}))

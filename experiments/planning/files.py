@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from experiments import registries
 from experiments.files import Resolved
 from experiments.schema import PLAN_FILE, ExecuteStage
-from mechanics.yaml_input import InputError
+from mechanics.yaml_input import InputError, Problem
 from planning.plan import Plan
 
 #: the folder of a run that holds its plans
@@ -18,14 +20,17 @@ FOLDER = "plans"
 SAME = 1e-9
 
 
-def plan_files(resolved: Resolved) -> dict[str, Plan]:
-    """The plans that execute stages take from files, by what stands there. Raises InputError, at that stage."""
+def plan_files(resolved: Resolved, own: Mapping[str, Path] = MappingProxyType({})) -> dict[str, Plan]:
+    """The plans that execute stages take from files, by what stands there. Raises InputError, at that stage.
+
+    ``own`` are copies that a run has taken of some of them, which then count.
+    """
     found: dict[str, Plan] = {}
     for i, stage in enumerate(resolved.experiment.stages):
         if isinstance(stage, ExecuteStage) and stage.from_file:
             _refuse_laws_that_plan(resolved, i, stage)
             if stage.plan not in found:
-                found[stage.plan] = _read(resolved, i, stage.plan)
+                found[stage.plan] = _read(resolved, i, stage.plan, own.get(stage.plan))
     return found
 
 
@@ -38,14 +43,14 @@ def _refuse_laws_that_plan(resolved: Resolved, i: int, stage: ExecuteStage) -> N
             raise InputError([resolved.experiment_document.problem(("stages", i, "controllers", n), wrong, expected)])
 
 
-def _read(resolved: Resolved, i: int, name: str) -> Plan:
+def _read(resolved: Resolved, i: int, name: str, own: Path | None) -> Plan:
     from planning.plan_file import PlanFileError, load
 
     def problem(wrong: str, expected: str) -> InputError:
         return InputError([resolved.experiment_document.problem(("stages", i, "plan"), wrong, expected)])
 
     try:
-        plan = load(_located(resolved, name))
+        plan = load(_located(resolved, name) if own is None else own)
     except PlanFileError as error:
         raise problem(error.problem, f"a plan that a run has left under {FOLDER}/ ({error.remedy})") from None
     if (other := _foreign(plan, resolved)) is not None:
@@ -78,7 +83,33 @@ def save_plan(plan: Plan, run_folder: Path) -> str:
     """Write a plan into the run's folder; return its path from there."""
     from planning.plan_file import save
 
-    path = run_folder / FOLDER / f"{plan.name}{PLAN_FILE}"
-    path.parent.mkdir(exist_ok=True)
-    save(plan, path)
-    return str(path.relative_to(run_folder))
+    file = file_of(plan.name)
+    (run_folder / file).parent.mkdir(exist_ok=True)
+    save(plan, run_folder / file)
+    return file
+
+
+def file_of(name: str) -> str:
+    """The path of a run's plan ``name`` from the run's folder."""
+    return f"{FOLDER}/{name}{PLAN_FILE}"
+
+
+def saved_plan(name: str, run_folder: Path) -> Plan | None:
+    """The plan ``name`` that lies in a run's folder; None where none does, or none that can be executed."""
+    from planning.plan_file import PlanFileError, load
+
+    try:
+        return load(run_folder / file_of(name))
+    except PlanFileError:
+        return None
+
+
+def own_plan(path: Path) -> Plan:
+    """A plan that a run has left in its folder. Raises InputError where that can no longer be read."""
+    from planning.plan_file import PlanFileError, load
+
+    try:
+        return load(path)
+    except PlanFileError as error:
+        expected = "the plan that the run has left there; without it, run the experiment anew"
+        raise InputError([Problem(str(path), None, "--resume", error.problem, expected)]) from None

@@ -18,17 +18,21 @@ from experiments.calibrate.samples import load_samples
 from experiments.calibrate.store import prints
 from experiments.files import Resolved, load
 from experiments.paper import beside
+from experiments.results_file import ShownResults, read_json
 from experiments.run_folder import RunFolder
 from mechanics import se2
 from mechanics.readings import TruthReading
 from mechanics.records import EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
+from mechanics.yaml_input import InputError, Problem
 from planning.plan import Plan
 
 SECOND = 1e-9
 
 
 @dataclass
-class _Trial:
+class LoggedTrial:
+    """A trial as the log has it; ``end`` is None where the log breaks off within it."""
+
     begin: TrialRecord
     end: TrialRecord | None = None
     waypoints: list[WaypointRecord] = field(default_factory=list)
@@ -37,23 +41,29 @@ class _Trial:
 
 
 @dataclass
-class _Log:
-    trials: list[_Trial] = field(default_factory=list)
+class Logs:
+    """What the logs of a run folder say, one after the other; ``ending`` says how the first broke off that did."""
+
+    trials: list[LoggedTrial] = field(default_factory=list)
     events: list[EventRecord] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
-    last_ns: int = 0
+    length_ns: int = 0
     ending: str = "there is no log"
+    current: LoggedTrial | None = None
 
 
 def collect(folder: RunFolder) -> dict[str, Any]:
     """The data that `experiments.report.page.render` takes, from what lies in ``folder``, torn or whole.
 
-    Raises InputError when the folder's experiment cannot be read.
+    Raises InputError when the folder's experiment or its results cannot be read.
     """
     resolved = load(str(folder.experiment))
-    results = json.loads(folder.results.read_text("utf-8")) if folder.results.is_file() else {}
+    results = _results(folder)
     known = results.get("calibration") or {}
-    log = _read(folder, resolved.experiment.report.playback_rate)
+    log, files = read_logs(folder, resolved.experiment.report.playback_rate), folder.logs()
+    mended = [told for told in (results.get("repair") or {"logs": []})["logs"] if told["ending"] != "complete"]
+    if log.ending == "complete" and mended:
+        log.ending = f"{mended[0]['ending']}; what was whole has been mended"
     bodies = {"go": resolved.grasped, "eo": resolved.extrinsic}
     return {
         "title": resolved.experiment.name,
@@ -66,11 +76,11 @@ def collect(folder: RunFolder) -> dict[str, Any]:
         "grasp": resolved.grasp.tolist(),
         "trials": [_trial(trial, resolved.grasp) for trial in log.trials],
         "log": {
-            "file": folder.log.name,
-            "bytes": folder.log.stat().st_size if folder.log.is_file() else 0,
+            "file": ", ".join(file.name for file in files) or folder.log.name,
+            "bytes": sum(file.stat().st_size for file in files),
             "messages": log.counts,
-            "lost": results.get("log", {}).get("lost"),
-            "seconds": log.last_ns * SECOND,
+            "lost": (results.get("log") or {}).get("lost"),
+            "seconds": log.length_ns * SECOND,
             "ending": log.ending,
         },
         "events": [{"t": event.capture_ns * SECOND, "level": event.level, "text": event.text} for event in log.events],
@@ -82,6 +92,17 @@ def collect(folder: RunFolder) -> dict[str, Any]:
             "only": all(stage.stage.startswith("calibrate_") for stage in resolved.experiment.stages),
         },
     }
+
+
+def _results(folder: RunFolder) -> dict[str, Any]:
+    """What results.json says; nothing where there is none. Raises InputError for one that is damaged."""
+    if not folder.results.is_file():
+        return {}
+    found = read_json(folder.results, ShownResults)
+    if found is None:
+        repair = f"extrinsic repair {folder.path} rebuilds it from the log"
+        raise InputError([Problem(str(folder.results), None, "", "no results can be read in it", repair)])
+    return found
 
 
 def _samples(file: Path) -> dict[str, Any] | str:
@@ -119,20 +140,32 @@ def _nominal(resolved: Resolved) -> list[dict[str, Any]]:
     ]
 
 
-def _read(folder: RunFolder, rate: float) -> _Log:
-    """One pass over the log; truth is thinned to ``rate`` [Hz] on the way."""
-    log = _Log()
-    if not folder.log.is_file():
-        return log
+def read_logs(folder: RunFolder, rate: float) -> Logs:
+    """One pass over the logs of a run; truth is thinned to ``rate`` [Hz] on the way.
+
+    The last trial of a log is left out where the next log begins with it again: the run went on with it.
+    """
+    log = Logs()
+    for file in folder.logs():
+        log.current, begun = None, len(log.trials)
+        ending = _read(file, log, rate)
+        if log.ending in ("complete", "there is no log"):
+            log.ending = ending
+        if 0 < begun < len(log.trials) and log.trials[begun].begin.trial == log.trials[begun - 1].begin.trial:
+            del log.trials[begun - 1]
+    return log
+
+
+def _read(file: Path, log: Logs, rate: float) -> str:
+    """Add what is in one file; how it ends."""
     try:
-        reader = LogReader(folder.log)
+        reader = LogReader(file)
     except ProtocolError as error:
-        log.ending = error.got
-        return log
-    next_truth = 0
+        return error.got
+    last_ns = next_truth = 0
     for message in reader.messages():
         log.counts[message.topic] = log.counts.get(message.topic, 0) + 1
-        log.last_ns = max(log.last_ns, message.publish_ns)
+        last_ns = max(last_ns, message.publish_ns)
         is_truth = message.topic.endswith("/world/truth")
         if is_truth and message.publish_ns < next_truth:
             continue
@@ -145,19 +178,20 @@ def _read(folder: RunFolder, rate: float) -> _Log:
         if isinstance(value, TruthReading):
             next_truth = message.publish_ns + round(1e9 / rate) - 1
         _file(log, value)
-    log.ending = reader.ending
-    return log
+    log.length_ns += last_ns
+    return reader.ending
 
 
-def _file(log: _Log, value: object) -> None:
-    current = log.trials[-1] if log.trials and log.trials[-1].end is None else None
+def _file(log: Logs, value: object) -> None:
+    current = log.current
     if isinstance(value, EventRecord):
         log.events.append(value)
     elif isinstance(value, TrialRecord):
         if value.status and current is not None:
-            current.end = value
+            current.end, log.current = value, None
         elif not value.status:
-            log.trials.append(_Trial(value))
+            log.current = LoggedTrial(value)
+            log.trials.append(log.current)
     elif current is None:
         return
     elif isinstance(value, WaypointRecord):
@@ -168,7 +202,7 @@ def _file(log: _Log, value: object) -> None:
         current.truths.append(value)
 
 
-def _trial(trial: _Trial, grasp: Any) -> dict[str, Any]:
+def _trial(trial: LoggedTrial, grasp: Any) -> dict[str, Any]:
     begin, end = trial.begin, trial.end
     start_ns = begin.capture_ns
     return {
@@ -191,11 +225,11 @@ def _states(states: Iterable[PlanarState | None]) -> dict[str, list[Any]]:
     return out
 
 
-def _waypoints(trial: _Trial, start_ns: int) -> dict[str, Any]:
+def _waypoints(trial: LoggedTrial, start_ns: int) -> dict[str, Any]:
     points = trial.waypoints
     simulated = any(point.truth is not None for point in points)
     contacts: list[list[dict[str, Any]]] = [[] for _ in points]
-    plan = _plan(trial)
+    plan = plan_of(trial)
     if plan is not None:
         contacts = [_planned_contacts(plan, point.step) for point in points]
     return {
@@ -207,13 +241,13 @@ def _waypoints(trial: _Trial, start_ns: int) -> dict[str, Any]:
     }
 
 
-def _plan(trial: _Trial) -> Plan | None:
+def plan_of(trial: LoggedTrial) -> Plan | None:
     """The plan that a trial executed; None where it was torn off, or made by a version that wrote plans otherwise."""
     if trial.end is None or not trial.end.plan:
         return None
     try:
         return Plan.from_dict(json.loads(trial.end.plan))
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
 
 
@@ -235,12 +269,12 @@ def _planned_contacts(plan: Plan, step: int) -> list[dict[str, Any]]:
     return out
 
 
-def _phase_at(trial: _Trial, capture_ns: int) -> str:
+def _phase_at(trial: LoggedTrial, capture_ns: int) -> str:
     before = [phase.phase for phase in trial.phases if phase.capture_ns <= capture_ns]
     return before[-1] if before else ""
 
 
-def _playback(trial: _Trial, start_ns: int) -> dict[str, Any]:
+def _playback(trial: LoggedTrial, start_ns: int) -> dict[str, Any]:
     """The plant's own motion."""
     truths = trial.truths
     return {
@@ -258,7 +292,7 @@ def _playback(trial: _Trial, start_ns: int) -> dict[str, Any]:
     }
 
 
-def _from_waypoints(trial: _Trial, start_ns: int) -> dict[str, Any]:
+def _from_waypoints(trial: LoggedTrial, start_ns: int) -> dict[str, Any]:
     """Without truth, as on hardware: what was measured at the waypoints."""
     points = trial.waypoints
     return {

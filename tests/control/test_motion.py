@@ -103,3 +103,23 @@ def test_sequence_numbers_count_up(arm, clock):
 def test_free_motions_keep_to_the_speed(arm, clock):
     mover(arm, clock).travel(np.array([0.1, 0.0, 0.0]))
     assert clock.slept == pytest.approx(2.0)
+
+
+def test_a_slower_pace_stretches_every_motion_along_the_same_path(arm, clock):
+    slow = Mover(arm, clock, 50.0, np.zeros(3), 0.05, pace=0.2)
+    slow.ramp(np.array([0.01, 0.0, 0.0]), 0.2)
+    assert clock.slept == pytest.approx(1.0)
+    assert max(t.twist[0] for t in arm.targets) == pytest.approx(1.875 * 0.01)  # peak of minimum jerk over 1 s
+    slow.follow(np.array([0.011, 0.0, 0.0]), np.array([0.05, 0.0, 0.0]))
+    assert clock.slept == pytest.approx(1.1)
+    assert [t.pose[0] for t in arm.targets[-5:]] == pytest.approx([0.0102, 0.0104, 0.0106, 0.0108, 0.011])
+    assert [t.twist[0] for t in arm.targets[-5:]] == pytest.approx([0.01] * 5)
+    slow.rest(0.1)
+    assert clock.slept == pytest.approx(1.2)
+
+
+def test_going_above_sweeps_nothing_off_the_table(arm, clock):
+    mover(arm, clock, (0.0, 0.1, 0.0)).go_above(np.array([0.02, 0.05, 0.1]))
+    poses = np.array([target.pose for target in arm.targets])
+    assert poses[-1] == pytest.approx([0.02, 0.05, 0.1])
+    assert (poses[poses[:, 0] < 0.02 - 1e-9, 1] == 0.1).all(), "it goes across before it goes down"

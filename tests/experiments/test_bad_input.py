@@ -67,15 +67,21 @@ CASES = {
         "sensor",
     ),
     "unknown key": (
-        ("mine.yaml", "station: sim", "weather: fine"),
-        "mine.yaml, line 2: weather: unknown key",
+        ("mine.yaml", "station: sim", "zodiac: fine"),
+        "mine.yaml, line 2: zodiac: unknown key",
         "one of calibration, extrinsic_object",
+        None,
+    ),
+    "a motion faster than the arm may be": (
+        ("mine.yaml", "sensor: soft", "trial: {approach_speed: 0.3}\nsensor: soft"),
+        "mine.yaml, line 3: trial.approach_speed: 0.3 m/s on the mean is 0.562 m/s in the middle of a motion",
+        "at most 0.133 m/s: the arm's limits.speed is 0.25 m/s",
         None,
     ),
     "misspelt key of a stage": (
         ("mine.yaml", "    plan: press", "    plan: press\n    trails: 2"),
         "mine.yaml, line 13: stages.1.trails: unknown key",
-        "one of controllers, first, plan, restiffen, settings, stage, trials",
+        "one of controllers, faults, first, plan, restiffen, settings, stage, trials",
         "trials",
     ),
     "misspelt parameter of a skill": (
@@ -129,7 +135,7 @@ CASES = {
     "unknown stage": (
         ("mine.yaml", "stage: execute", "stage: exicute"),
         "mine.yaml, line 11: stages.1.stage: unknown value 'exicute'",
-        "calibrate_friction, execute, plan",
+        "calibrate_friction, execute, faults, plan",
         "execute",
     ),
     "unknown sensor": (

@@ -20,8 +20,8 @@ from drivers.errors import DeviceFault, DriverError, NotConnected
 from drivers.interfaces import ArmTarget
 from drivers.station import Devices, Station, listening
 from drivers.wire.bus import Bus
-from drivers.wire.client import RemoteSensor
 from drivers.wire.log_reader import LogReader
+from drivers.wire.remote import RemoteSensor
 
 from .cases import MASS, scene, station
 

@@ -66,6 +66,7 @@ def test_the_log_holds_as_many_messages_as_were_published(config: StationConfig,
     expected = {
         "sim/arm/pose": 200,
         "sim/arm/target": 100,
+        "sim/arm/safety": 1,  # as its commander took it
         "sim/wrist_ft/wrench": 2000,
         "sim/table_ft/wrench": 2000,
         "sim/gripper/state": 40,

@@ -147,7 +147,8 @@ class FakeArm(Arm):
     def push(self, sequence: int) -> None:
         self._push(PoseReading(Stamp(sequence, sequence, sequence, "world"), np.array([0.1, 0.2, 0.3])))
 
-    def _open(self, timeout: float) -> None: ...
+    def _open(self, timeout: float) -> None:
+        self.push(-1)  # an arm knows where it is
 
     def _shut(self) -> None: ...
 

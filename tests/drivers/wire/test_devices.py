@@ -45,7 +45,7 @@ def arm(arm_server: ArmServer, link: Link) -> Iterator[RemoteArm]:
 
 
 def target(x: float = 0.1, duration: float = 0.02) -> ArmTarget:
-    return ArmTarget(np.array([x, 0.2, 0.3]), np.array([0.0, 0.1, 0.0]), duration)
+    return ArmTarget(np.array([x, 0.2, 0.3]), np.array([0.0, 0.01, 0.0]), duration)
 
 
 def arrived(device: Any, sequence: int) -> None:
@@ -206,10 +206,10 @@ def test_a_server_that_goes_makes_every_later_call_a_fault(
 def test_a_commander_with_the_lease_moves_the_arm(arm: RemoteArm, fake_arm: Any) -> None:
     with arm.lease("me"):
         arm.command(target(0.1))
-        arm.command(target(0.2))
-    assert [t.pose[0] for t in fake_arm.targets] == [0.1, 0.2]
+        arm.command(target(0.1003))
+    assert [t.pose[0] for t in fake_arm.targets] == [0.1, 0.1003]
     assert [t.sequence for t in fake_arm.targets] == [0, 1]
-    assert np.array_equal(fake_arm.targets[0].twist, [0.0, 0.1, 0.0])
+    assert np.array_equal(fake_arm.targets[0].twist, [0.0, 0.01, 0.0])
     assert fake_arm.did[-1] == "release"
 
 
@@ -356,9 +356,9 @@ def test_accepted_targets_are_a_stream(arm: RemoteArm, joined: Bus) -> None:
     got: list[Any] = []
     subscription.listen(lambda sample: got.append(messages.decode(sample.payload, messages.TARGET)))
     with arm.lease("me"):
-        arm.command(target(0.25))
-        arm.command(target(0.5))
-    assert [value.pose[0] for value in got] == [0.25, 0.5]
+        arm.command(target(0.1003))
+        arm.command(target(0.1006))
+    assert [value.pose[0] for value in got] == [0.1003, 0.1006]
 
 
 def test_holders_of_one_name_are_told_apart() -> None:

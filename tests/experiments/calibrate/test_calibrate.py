@@ -24,7 +24,7 @@ name: short
 grasped_object: tall_box
 extrinsic_object: hbox
 friction: {go-ground: 0.3, go-eo: 0.35, eo-ground: 0.4}
-trial: {approach_speed: 0.3}
+trial: {approach_speed: 0.12}
 stages:
   - {stage: calibrate_force_torque, orientations: 4, seconds: 0.1}
   - {stage: calibrate_camera, views: 9, poses: 6}

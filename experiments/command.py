@@ -1,0 +1,58 @@
+"""How every command of `extrinsic` is registered: with an example, and with one clear end for each way to fail."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import wraps
+from typing import Annotated, Any, TypeVar
+
+import typer
+
+from experiments.exit_codes import ExitCode
+
+Command = TypeVar("Command", bound=Callable[..., None])
+
+StationName = Annotated[str, typer.Argument(metavar="STATION", help="A station file, or a shipped one's name.")]
+Sets = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Set a key of the experiment or the station; may be repeated."),
+]
+
+
+def commands(app: typer.Typer) -> Callable[[str], Callable[[Command], Command]]:
+    """What registers a command of ``app``: ``command = commands(app)``, then ``@command("extrinsic run ...")``.
+
+    Each way to fail ends with its exit code and one clear message.
+    """
+
+    def command(example: str) -> Callable[[Command], Command]:
+        def register(function: Command) -> Command:
+            @wraps(function)
+            def orderly(*arguments: Any, **options: Any) -> None:
+                from drivers.errors import DriverError
+                from mechanics.yaml_input import InputError
+                from planning.errors import InfeasiblePlan
+
+                try:
+                    function(*arguments, **options)
+                except InputError as error:
+                    raise _ended(error, ExitCode.BAD_INPUT) from None
+                except InfeasiblePlan as error:
+                    raise _ended(error, ExitCode.INFEASIBLE) from None
+                except DriverError as error:
+                    raise _ended(error, ExitCode.DEVICE_FAILED) from None
+                except KeyboardInterrupt:
+                    raise typer.Exit(ExitCode.INTERRUPTED) from None
+
+            app.command(epilog=f"Example: {example}")(orderly)
+            return function
+
+        return register
+
+    return command
+
+
+def _ended(error: Exception, code: ExitCode) -> typer.Exit:
+    sys.stderr.write(f"{error}\n")
+    return typer.Exit(code)

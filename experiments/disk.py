@@ -1,0 +1,58 @@
+"""Room for a run's data: looked for before the start, and missed in one sentence where it ends later."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from pathlib import Path
+
+from drivers.errors import DeviceFault
+from experiments import registries
+from experiments.files import Resolved
+from experiments.schema import ExecuteStage
+from experiments.setup import has_fingers
+from mechanics.yaml_input import InputError, Problem
+
+#: what has to be free besides the data that a run is expected to log [bytes]
+FLOOR = 200 * 10**6
+#: what a trial logs at most, as a rule [bytes]: under a law that feels through the fingers, and under any other
+FELT, BLIND = 50 * 10**6, 5 * 10**6
+
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+
+
+def expected(resolved: Resolved) -> int:
+    """About how much a run will log [bytes]."""
+    laws, total = registries.controllers(), 0
+    for stage in resolved.experiment.stages:
+        if isinstance(stage, ExecuteStage):
+            feels = [has_fingers(resolved) and laws[name].feedback for name in stage.controllers]
+            total += stage.trials * sum(FELT if one else BLIND for one in feels)
+    return total
+
+
+def require_room(resolved: Resolved, folder: Path) -> None:
+    """Raises InputError where ``folder``, which need not exist yet, has too little room for a run."""
+    there = folder.absolute()
+    while not there.is_dir() and there != there.parent:
+        there = there.parent
+    try:
+        free = shutil.disk_usage(there).free
+    except OSError:  # whether it can be written is asked next
+        return
+    needed = FLOOR + expected(resolved)
+    if free < needed:
+        wrong = f"{free / 1e6:.0f} MB are free there, and the run may need {needed / 1e6:.0f} MB"
+        remedy = "a folder with more room, or fewer trials at a time"
+        raise InputError([Problem(str(folder), None, "--out", wrong, remedy)])
+
+
+def is_full(error: OSError) -> bool:
+    """Whether a disk that is full, or takes nothing more, is to blame."""
+    return error.errno in _FULL
+
+
+def not_written(path: Path | str | None, why: str, run_folder: Path) -> DeviceFault:
+    """What a run ends with whose files cannot be written any more."""
+    remedy = f"What came before is kept. Make room there, then go on: extrinsic run --resume {run_folder}"
+    return DeviceFault("disk", f"write {path or run_folder}", why, remedy)

@@ -1,0 +1,94 @@
+"""JSON that a run or a campaign left, read back: what others build on is there and of its kind, or it is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, Field
+
+#: a trial's figures are 6 deep in results.json
+_DEPTH = 32
+
+Word = Annotated[str, Field(max_length=1000)]
+
+
+class Planned(BaseModel):
+    """What a table needs of a trial that was not run; a row says more."""
+
+    skill: Word | None
+    controller: Word
+
+
+class Figure(BaseModel):
+    """Mean and spread over the waypoints of a trial."""
+
+    mean: float
+    std: float
+
+
+Errors = dict[Word, Figure | None]
+
+
+class Trial(Planned):
+    """What tables and the report need of a row of results.json."""
+
+    status: Word
+    reason: str = ""
+    measured: Errors | None = None
+    truth: Errors | None = None
+
+
+class _Mended(BaseModel):
+    ending: str
+
+
+class _Repair(BaseModel):
+    logs: list[_Mended]
+
+
+class _Ended(BaseModel):
+    status: Word
+    reason: str
+    calibration: dict[Word, dict[str, Any]] | None = None
+    plans: list[dict[str, Any]] = []
+    log: dict[str, Any] | None = None
+    repair: _Repair | None = None
+
+
+class Results(_Ended):
+    """results.json (design §6), as far as tables are made of it."""
+
+    trials: list[Trial]
+
+
+class NamedTrial(Trial):
+    """A trial that the report shows."""
+
+    name: Word
+
+
+class ShownResults(_Ended):
+    """results.json, as far as the report shows it."""
+
+    trials: list[NamedTrial]
+
+
+def read_json(file: Path, model: type[BaseModel]) -> dict[str, Any] | None:
+    """The JSON in ``file``, which says at least what ``model`` asks for; None where it does not, or is not there."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse)
+        model.model_validate(found, strict=True)
+        return found if _depth(found) <= _DEPTH else None
+    except (FileNotFoundError, ValueError, RecursionError):  # pydantic's error is a ValueError
+        return None
+
+
+def _depth(value: Any) -> int:
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return 1 + max(map(_depth, inner), default=0)
+
+
+def _refuse(name: str) -> Any:
+    raise ValueError(f"{name} is no figure")
