@@ -28,6 +28,8 @@ NANO = 1e-9
 CONFIRMED = 3
 #: a sudden change is that of the force smoothed over the first time against the second [s]
 _FAST, _SLOW = 0.005, 0.05
+#: no arm does anything within less [s]
+SHORTEST = 1e-3
 _ROUNDING = 1 + 1e-6  # a motion that was planned at a limit is within it
 _ASKED = "command a set-point"
 
@@ -227,9 +229,11 @@ class Gates:
         step = np.asarray(target.pose, float) - start
         step[2] = se2.wrap(step[2])
         T, twist = target.duration, np.asarray(target.twist, float)
-        mean = step / T if T > 0 else np.where(step == 0, 0.0, np.inf)
-        change = (twist - before) / T if T > 0 else np.zeros(3)
-        reach = 2 * (mean - before) / T if T > 0 else np.zeros(3)
+        if T < SHORTEST:
+            self._refuse(f"a duration of {T:.3g} s", f"Give the arm {SHORTEST:g} s at least")
+        with np.errstate(over="ignore"):  # what is infinite is beyond every limit
+            mean = step / T
+            change, reach = (twist - before) / T, 2 * (mean - before) / T
         for what, values, limit, turn, unit in (
             ("step", (step,), limits.step_mm * 1e-3, math.radians(limits.step_deg), ""),
             ("speed", (mean, twist), limits.speed, math.radians(limits.turn_speed_deg), "/s"),

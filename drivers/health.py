@@ -58,6 +58,17 @@ class StationHealth:
                 if described.rate > 0:
                     self._streams.append((device, described))
 
+    def streams(self) -> dict[str, dict[str, float | None]]:
+        """Age of the newest reading [s] (negative where a device's clock is ahead of ours) and rate [Hz], by device."""
+        now_ns = self._clock.now_ns()
+        found: dict[str, dict[str, float | None]] = {}
+        for device, _ in self._streams:
+            heard = device.heard(now_ns - round(_SPAN / NANO))
+            age = (now_ns - heard[-1][0]) * NANO if heard else None
+            span = (heard[-1][0] - heard[0][0]) * NANO if len(heard) > 1 else 0.0
+            found[device.name] = {"age_s": age, "rate_Hz": (len(heard) - 1) / span if span > 0 else None}
+        return found
+
     def ailments(self) -> list[Ailment]:
         """What is wrong now, by device; empty where all is well."""
         now_ns = self._clock.now_ns()

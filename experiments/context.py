@@ -13,6 +13,7 @@ from typing import Any
 from control.observe import Finger
 from control.settings import TrialSettings
 from drivers.errors import DriverError
+from drivers.health import StationHealth
 from drivers.hosting import HostProcess
 from drivers.scene import Scene
 from drivers.station import Devices, Hosting, Station
@@ -28,6 +29,8 @@ from mechanics.records import EventRecord, PhaseRecord, TrialRecord, WaypointRec
 from planning.plan import Plan
 from planning.skills.base import SkillTask
 
+#: no stream's readings should be older when they arrive, nor be of the future by more [s]
+LATENCY, CLOCKS = 0.1, 0.005
 #: the streams have spoken before the first stage needs them [s]
 WARM_UP = 0.2
 #: figures of the plant's health that count up; of the others the worst counts
@@ -89,6 +92,7 @@ class RunContext:
                     )
                 devices.clock.sleep(WARM_UP)
             self._devices = devices
+            self._look_at_clocks(devices)
         return self._devices
 
     def begin(self, scene: Scene, *, part: int = 0, trial: int | None = None) -> None:
@@ -129,6 +133,16 @@ class RunContext:
                 else:
                     found[name] = found[name] + value if name in _SUMS else max(found[name], value)
         self.results["health"] = found
+
+    def _look_at_clocks(self, devices: Devices) -> None:
+        """Age and rate of every stream go into the results; a clock that disagrees with ours is a warning."""
+        streams = StationHealth(devices).streams()
+        self.results["streams"] = streams
+        for name, found in streams.items():
+            age = found["age_s"]
+            if age is not None and not -CLOCKS <= age <= LATENCY:
+                said = f"{age:.3g} s old when they arrive" if age > 0 else f"of {-age:.3g} s in the future"
+                self.event("warning", f"{name}: its readings are {said}: see that its clock agrees with this machine's")
 
     def fingers(self) -> tuple[Finger, ...]:
         """The tactile fingers, where controllers are to feel; they are made ready at the first call."""

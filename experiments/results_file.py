@@ -50,7 +50,7 @@ class _Repair(BaseModel):
 
 class _Ended(BaseModel):
     status: Word
-    reason: str
+    reason: str = ""
     calibration: dict[Word, dict[str, Any]] | None = None
     plans: list[dict[str, Any]] = []
     log: dict[str, Any] | None = None

@@ -41,6 +41,17 @@ def test_nothing_is_wrong_with_a_station_that_is_well(devices: Devices, health: 
         devices.clock.sleep(0.02)
 
 
+def test_age_and_rate_of_every_stream_are_told(devices: Devices, health: StationHealth) -> None:
+    devices.clock.sleep(0.5)
+    told = health.streams()
+    # the profile's latencies, and at most a period more
+    for name, latency, rate in (("arm", 0.02, 100.0), ("wrist_ft", 0.002, 1000.0), ("gripper", 0.0, 20.0)):
+        age, heard = told[name]["age_s"], told[name]["rate_Hz"]
+        assert age is not None and heard is not None
+        assert latency <= age <= latency + 1.0 / rate
+        assert heard == pytest.approx(rate, rel=1e-3)
+
+
 @pytest.mark.parametrize("device", ["arm", "wrist_ft", "gripper"])
 def test_a_silent_sensor_is_noticed_after_three_of_its_periods(
     devices: Devices, health: StationHealth, device: str
