@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Self
 
 import numpy as np
 
+from control.settings import TrialSettings
 from drivers.interfaces import Arm, ArmTarget, Clock
 from mechanics import se2
 from mechanics.readings import Array
@@ -41,6 +43,13 @@ class Mover:
         self._arm, self._clock, self._period = arm, clock, 1.0 / rate
         self._sequence = 0
         self._tick = tick
+
+    @classmethod
+    def of(
+        cls, arm: Arm, clock: Clock, start: Array, settings: TrialSettings, tick: Callable[[], None] = lambda: None
+    ) -> Self:
+        """The mover that a trial's ``settings`` ask for."""
+        return cls(arm, clock, settings.control_rate, start, settings.approach_speed, tick, settings.speed)
 
     def _send(self, pose: Array, twist: Array) -> None:
         self._sequence += 1

@@ -53,15 +53,7 @@ class Rehearsal:
         self._plan, self._up = plan, np.append(lift * UP, 0.0)
         self._observer, self._clock, self._load = observer, clock, load
         self._settings, self._watch = settings, watch
-        self._mover = Mover(
-            observer.arm,
-            clock,
-            settings.control_rate,
-            observer.arm_pose(),
-            settings.approach_speed,
-            watch.tick,
-            settings.speed,
-        )
+        self._mover = Mover.of(observer.arm, clock, observer.arm_pose(), settings, watch.tick)
         self._force = 0.0
 
     def run(self) -> RehearsalResult:

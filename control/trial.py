@@ -83,15 +83,7 @@ class Trial:
         self._settings, self._watch = settings, watch
         self._result = TrialResult("completed", "", plan)
         self._slip_told = self._witness_told = False
-        self._mover = Mover(
-            observer.arm,
-            clock,
-            settings.control_rate,
-            observer.arm_pose(),
-            settings.approach_speed,
-            watch.tick,
-            settings.speed,
-        )
+        self._mover = Mover.of(observer.arm, clock, observer.arm_pose(), settings, watch.tick)
 
     def run(self) -> TrialResult:
         """Run the whole protocol. Returns how it ended.

@@ -29,6 +29,7 @@ from experiments.report.collect import LoggedTrial, Logs, plan_of, read_logs
 from experiments.results_file import ShownResults, read_json
 from experiments.run_folder import RunFolder, write_atomic, write_json
 from experiments.run_lock import RunLock
+from experiments.runner import begun
 from mechanics.yaml_input import InputError
 from planning.plan import Plan
 from planning.plan_file import SUFFIX, PlanFileError
@@ -152,24 +153,9 @@ def _results(folder: RunFolder) -> dict[str, Any] | None:
 
 def _begun(folder: RunFolder, resolved: Resolved) -> dict[str, Any]:
     """The results of a run of which no results.json is left, without its trials."""
-    world = resolved.station.world
-    return {
-        "schema": 1,
-        "status": "running",
-        "reason": "",
-        "experiment": resolved.experiment.name,
-        "station": resolved.station.name,
-        "profile": None if world is None else world.profile,
-        "seed": resolved.experiment.seed,
-        "started": _started(folder),
-        "provenance": None,
-        "calibration": _calibrations(folder).told(),
-        "plans": _plans(folder),
-        "trials": [],
-        "not_run": [],
-        "tables": [],
-        "timing": {"execute_wall_s": None, "execute_station_s": None},
-    }
+    unknown = {"execute_wall_s": None, "execute_station_s": None}
+    own = {"started": _started(folder), "provenance": None, "plans": _plans(folder), "timing": unknown}
+    return begun(resolved, _calibrations(folder)) | own
 
 
 def _started(folder: RunFolder) -> str | None:

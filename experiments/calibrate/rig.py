@@ -156,13 +156,5 @@ def at_hand(context: RunContext, what: str) -> Iterator[Rig]:
         context.event("info", f"calibrate {what}")
         context.begin(setup.scene(context.resolved), part=1 + context.results["progress"]["stage"])
         observer = setup.observer(context.resolved, devices, context.settings, context.believed)
-        settings = context.settings
-        mover = Mover(
-            devices.arm,
-            devices.clock,
-            settings.control_rate,
-            observer.arm_pose(),
-            settings.approach_speed,
-            context.heed,
-        )
+        mover = Mover.of(devices.arm, devices.clock, observer.arm_pose(), context.settings, context.heed)
         yield Rig(context, devices, observer, mover)
