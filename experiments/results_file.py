@@ -50,7 +50,6 @@ class _Repair(BaseModel):
 
 class _Ended(BaseModel):
     status: Word
-    reason: str = ""
     calibration: dict[Word, dict[str, Any]] | None = None
     plans: list[dict[str, Any]] = []
     log: dict[str, Any] | None = None
@@ -60,6 +59,7 @@ class _Ended(BaseModel):
 class Results(_Ended):
     """results.json (design §6), as far as tables are made of it."""
 
+    reason: str
     trials: list[Trial]
 
 

@@ -71,7 +71,7 @@ def resume(
         results = _results(folder)
         if results is not None and _is_finished(results, resolved):
             console.print(f"{escape(str(run))}: finished already, as {results['status']}", soft_wrap=True)
-            return Outcome(_code(results), folder, results, results["reason"])
+            return Outcome(_code(results), folder, results, results.get("reason", ""))
         calibrations = store.load(resolved) if results is None else _calibrations(results, folder)
         own = [] if results is None else [row for row in results["plans"] if "from" in row]
         check(resolved, calibrations, feasible=False, own={row["from"]: run / row["file"] for row in own})
