@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from rich.console import Console
 
 from drivers.errors import ProtocolError
 from drivers.sim.host_thread import HostThread
+from drivers.wire import messages
 from drivers.wire.log_reader import LogReader
 from experiments.context import RunContext
 from experiments.faults.inject import INJECTED
@@ -21,8 +21,8 @@ from experiments.faults.schema import Cell, FaultsStage, Moment, TimedFault
 from experiments.files import Resolved
 from experiments.ports import own_bus
 from experiments.run_folder import RunFolder
-from experiments.schema import ExecuteStage, Stage
-from mechanics.readings import PoseReading, WrenchReading
+from experiments.schema import ExecuteStage, HealthConfig, Stage
+from mechanics.readings import WrenchReading
 from mechanics.records import EventRecord
 
 #: from the instant at which a fault can be noticed: two periods of the set-points
@@ -31,7 +31,6 @@ CONTROL_PERIODS = 2
 SENSOR_PERIODS = 3
 #: the force may pass its limit by this factor, by what moves on before the arm has stopped
 OVERSHOOT = 1.2
-_MOVES = 1e-6  # less than this between two readings is rest [m, rad]
 
 
 @dataclass(frozen=True)
@@ -89,7 +88,8 @@ def _run(resolved: Resolved, stage: FaultsStage, cell: Cell, moment: Moment, fol
         {"stage": "execute", "plan": stage.plan, "controllers": (stage.controller,), "faults": (fault,)}
     )
     plans: list[Stage] = [other for other in resolved.experiment.stages if getattr(other, "name", "") == stage.plan]
-    experiment = resolved.experiment.model_copy(update={"stages": (*plans, execute)})
+    health = HealthConfig(on_fault="warn")  # what a fault makes of the trial is to be seen, not its end
+    experiment = resolved.experiment.model_copy(update={"stages": (*plans, execute), "health": health})
     station = resolved.station
     changed: dict[str, Any] = {"bus": own_bus(station.bus)}
     if stage.profile is not None and station.world is not None:
@@ -121,14 +121,16 @@ def _found(path: Path, results: dict[str, Any], resolved: Resolved) -> Found:
 
 
 def _logged(folder: RunFolder, resolved: Resolved) -> tuple[bool, float | None, float | None]:
-    """Whether the log is whole, for how long the arm moved on after the fault, and the greatest force at the wrist."""
+    """Whether the log is whole, how long after the fault the last set-point ended, and the greatest force."""
     station = resolved.station.name
-    arm, wrist = f"{station}/arm/pose", f"{station}/wrist_ft/wrench"
+    target, wrist = f"{station}/arm/target", f"{station}/wrist_ft/wrench"
     begin: int | None = None
-    force, poses = 0.0, []
+    force, until = 0.0, 0
     reader = LogReader(folder.log)
-    for logged in reader.messages():
-        if logged.topic not in (arm, wrist, "run/event"):
+    for logged in reader.messages((target, wrist, "run/event")):
+        if logged.topic == target:
+            sent = messages.decode(logged.payload, messages.TARGET)
+            until = messages.stamp_ns(sent.header.stamp) + round(sent.duration * 1e9)
             continue
         try:
             value = logged.value()
@@ -138,14 +140,7 @@ def _logged(folder: RunFolder, resolved: Resolved) -> tuple[bool, float | None, 
             begin = value.capture_ns
         elif isinstance(value, WrenchReading):
             force = max(force, float(np.linalg.norm(value.wrench[:3])))
-        elif isinstance(value, PoseReading):
-            poses.append((value.stamp.capture_ns, value.pose))
-    moved = [
-        at
-        for (_, before), (at, pose) in pairwise(poses)
-        if begin is not None and at > begin and np.abs(pose - before).max() > _MOVES
-    ]
-    moved_on = None if begin is None else (moved[-1] - begin) * 1e-9 if moved else 0.0
+    moved_on = None if begin is None else max(0, until - begin) * 1e-9
     return reader.complete, moved_on, force
 
 
