@@ -31,7 +31,7 @@ _NO_ARCHIVE = (
     ValueError,
     KeyError,
     EOFError,
-    NotImplementedError,
+    NotImplementedError,  # zipfile raises it for a compression that it does not know
     RuntimeError,
     struct.error,
     zlib.error,

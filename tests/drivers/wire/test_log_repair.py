@@ -287,7 +287,7 @@ while True:
     if i % 100 == 0:
         print(now, flush=True)
     i += 1
-    time.sleep(0.002)
+    time.sleep(0.002)  # a source's pace: without one the claim, of seconds lost, would be of a flooded disk
 """
 
 
