@@ -108,7 +108,7 @@ class ArmLimits(Strict):
     step_deg: float = Field(default=30.0, gt=0)
     speed: float = Field(default=0.25, gt=0, description="the reduced speed of ISO 10218 [m/s]")
     turn_speed_deg: float = Field(default=150.0, gt=0, description="[deg/s]")
-    acceleration: float = Field(default=6.0, gt=0, description="[m/s²]")
+    acceleration: float = Field(default=4.0, gt=0, description="[m/s²]")
     turn_acceleration_deg: float = Field(default=2000.0, gt=0, description="[deg/s²]")
     age: float = Field(default=0.2, gt=0, description="how long a set-point may be under way [s]")
     force: float = Field(default=40.0, gt=0, description="stops the arm [N]")
