@@ -57,6 +57,7 @@ def fit_elasticity(
     holds: ArrayLike | None = None,
     drift_order: int = 0,
     gain_error: float = GAIN_ERROR,
+    pose_noise_from_residuals: bool = False,
 ) -> ElasticityFit:
     """Identify the finger from ``x`` (n, 3), the displacement of ee in gocf, and ``w`` (n, 3), its wrench on the go.
 
@@ -65,8 +66,9 @@ def fit_elasticity(
     ``times`` (n,) [s] of the samples, hysteresis and creep are tested for and taken out too, and ``drift_order`` > 0
     lets the wrench's zero wander as such a polynomial. Samples with one number in ``holds`` (n,) are readings of the
     wrench at different times of one hold, whose displacement is the mean of theirs and has ``x_covariance``: what they
-    differ by is creep, free of the pose's noise. ``gain_error`` (relative) widens the
-    covariance. All but the first method are linear.
+    differ by is creep, free of the pose's noise. ``gain_error`` (relative) widens the covariance.
+    ``pose_noise_from_residuals``: ``x_covariance`` is only where one begins, the maximum-likelihood fit is weighted by
+    the variances that its own residuals show. All but the first method are linear.
     Raises FitError for NaN, fewer samples than unknowns, axes that the samples do not excite (it names them), wrenches
     that are zero, or a stiffness that is not positive definite.
     """
@@ -90,10 +92,14 @@ def fit_elasticity(
         samples = _seen_from(nominal, offset)
     if method == "errors_in_variables":
         found = maximum_likelihood(samples, K, stiffening)
-        offset = se2.compose(offset, found.offset)
-        samples = _seen_from(nominal, offset)
-        # the rest of the offset is below a hundredth of a millimetre: this only settles it
-        found = maximum_likelihood(samples, found.stiffness, found.terms)
+        # the rest of the offset is below a hundredth of a millimetre: once more settles it, and once more the weights,
+        # since the residuals of a fit with wrong ones are too large
+        for _ in range(2 if pose_noise_from_residuals else 1):
+            offset = se2.compose(offset, found.offset)
+            samples = _seen_from(nominal, offset)
+            if pose_noise_from_residuals:
+                samples = samples.replaced(x_covariance=found.x_covariance)
+            found = maximum_likelihood(samples, found.stiffness, found.terms)
         K, a, covariance, memory = found.stiffness, found.stiffening, found.covariance, found.memory
         residual, chi2, lever = found.residual, found.chi2, found.lever
     else:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 from scipy.stats import f as fisher
 
 from estimation.elasticity_methods import Samples
@@ -23,6 +23,8 @@ from mechanics.readings import Array
 SIGNIFICANCE = 0.01
 #: 1 sigma of the point about which the torque is known [m]: gains off by half a percent, and a lever, at 200 to 400 mm
 LEVER_ERROR = 0.002
+#: by how much the displacements' variances may differ from what was given
+NOISE_RANGE = 100.0
 #: parameters without terms: six of K, three of the offset, two of the lever
 BASE = 11
 #: the law's terms beyond K, in the order in which they are asked for
@@ -31,7 +33,10 @@ STIFFENING, HYSTERESIS, CREEP = "stiffening", "hysteresis", "creep"
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The maximum: as in `ElasticityFit`, with ``terms`` that were asked for and the ``residual`` (n, 3) wrenches."""
+    """The maximum: as in `ElasticityFit`, with ``terms`` that were asked for and the ``residual`` (n, 3) wrenches.
+
+    ``x_covariance`` (3, 3) of a hold's displacement is what the residuals ask for, not what the fit was weighted by.
+    """
 
     stiffness: Array
     stiffening: float
@@ -42,6 +47,7 @@ class Found:
     residual: Array
     chi2: float
     terms: tuple[str, ...]
+    x_covariance: Array
 
 
 def maximum_likelihood(samples: Samples, start: Array, terms: bool | tuple[str, ...] | None) -> Found:
@@ -171,18 +177,42 @@ class _Likelihood:
             J = J + (a * s)[:, None, None] * K + bend[:, None, None] * pull[:, :, None] * pull[:, None, :]
         return r, J
 
+    def displacement_noise(self, terms: tuple[str, ...], p: Array) -> Array:
+        """The covariance (3, 3) of displacements, diagonal, that makes what the law leaves in the holds most likely.
+
+        r̄ ~ N(0, Σ_w / n + J diag(v) Jᵀ) in each hold, over v within `NOISE_RANGE` of the given variances. A law that is
+        a little wrong counts as noise, as it should: its weight falls with it.
+        """
+        samples = self._samples
+        r, J = self.residual(terms, p)
+        given = np.diag(samples.x_covariance)
+
+        def unlikely(log_share: Array) -> float:
+            white, root = self._white(r, J, np.diag(given * np.exp(log_share)))
+            logdet = 2 * np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum() * (len(samples.count) / len(root))
+            return float(white @ white + logdet)
+
+        most = np.log(NOISE_RANGE)
+        found = minimize(unlikely, np.zeros(3), method="L-BFGS-B", bounds=[(-most, most)] * 3)
+        return np.diag(given * np.exp(found.x))
+
     def _whitened(self, p: Array, terms: tuple[str, ...]) -> Array:
-        """Pure numbers (holds · 3 + n · 3 + 2,) whose squares add up to the cost; last, the lever's prior.
+        """Pure numbers (holds · 3 + n · 3 + 2,) whose squares add up to the cost; last, the lever's prior."""
+        r, J = self.residual(terms, p)
+        return np.concatenate([self._white(r, J, self._samples.x_covariance)[0], p[9:BASE]])
+
+    def _white(self, r: Array, J: Array, x_covariance: Array) -> tuple[Array, Array]:
+        """Residuals as pure numbers (holds · 3 + n · 3,), and the Cholesky factors of the holds' covariances.
 
         The readings of a hold share its displacement and the noise of that: their mean carries it, and what they differ
         by does not. Without this, a creep of a tenth of a newton would be looked for under a pose's noise.
         """
         samples = self._samples
-        r, J = self.residual(terms, p)
         mean, away = samples.split(r)
         J = J[samples.first] if len(J) > 1 else J
-        S = samples.w_covariance / samples.count[:, None, None] + J @ samples.x_covariance @ J.swapaxes(-1, -2)
-        inverse_mean, inverse_w = np.linalg.inv(np.linalg.cholesky(S)), self._inverse_w
+        S = samples.w_covariance / samples.count[:, None, None] + J @ x_covariance @ J.swapaxes(-1, -2)
+        root = np.linalg.cholesky(S)
+        inverse_mean, inverse_w = np.linalg.inv(root), self._inverse_w
         white = np.concatenate([np.einsum("gij,gj->gi", inverse_mean, mean).ravel(), (away @ inverse_w.T).ravel()])
         if samples.drift.shape[1]:
             # the wandering zero is linear: taken out by projection, whatever its size
@@ -194,7 +224,7 @@ class _Likelihood:
                 ]
             )
             white = white - basis @ np.linalg.solve(basis.T @ basis, basis.T @ white)
-        return np.concatenate([white, p[9:BASE]])
+        return white, root
 
     def found(self, terms: tuple[str, ...], p: Array, cost: float) -> Found:
         """The value of a maximum, with a covariance that is right also where the noise is not what was given."""
@@ -229,7 +259,8 @@ class _Likelihood:
         size_of = len(keep)
         covariance[:size_of, :size_of] = whole[np.ix_(keep, keep)] * np.outer(scale[:size_of], scale[:size_of])
         r, _ = self.residual(terms, p)
-        return Found(K, a, memory, offset, p[9:BASE] * LEVER_ERROR, covariance, r, cost / freedom, terms)
+        noise = self.displacement_noise(terms, p)
+        return Found(K, a, memory, offset, p[9:BASE] * LEVER_ERROR, covariance, r, cost / freedom, terms, noise)
 
     def _scores(self, terms: tuple[str, ...], p: Array) -> Array:
         step = 1e-6

@@ -19,6 +19,7 @@ from estimation.elasticity_fit import METHODS, fit_elasticity
 from estimation.finger_memory import Path, size
 from estimation.friction_fit import baselines, fit_friction
 from experiments.bench.figures import Figure, figure_of
+from experiments.calibrate.elasticity import shares
 from mechanics import se2
 from mechanics.catalogue import load_sensor
 from mechanics.readings import Array
@@ -62,15 +63,6 @@ class Session:
         return (1 + self.membrane.stiffening * size(self.K, x))[..., None] * (x @ self.K)
 
 
-def protocol(rng: np.random.Generator, samples: int, amplitude: Array = AMPLITUDE) -> Array:
-    """The displacements (n, 3) that are held: two thirds at random in the box, one third along its axes, shuffled."""
-    axial = samples // 3
-    held = rng.uniform(-1, 1, (samples, 3))
-    along = np.arange(axial) % 3
-    held[:axial] = np.eye(3)[along] * rng.uniform(-1, 1, (axial, 1))
-    return rng.permutation(held) * amplitude
-
-
 def session(
     nominal: Array,
     seed: int,
@@ -101,7 +93,7 @@ def session(
     offset = lab.grasp_offset(seed)
     repeat = figures.arm.repeatability.si
     sensor = Electronics(ForceTorqueFigures() if ideal_sensor else figures.force_torque, RATE, rng)
-    targets = protocol(rng, samples, amplitude) if held is None else held
+    targets = shares(samples, rng) * amplitude if held is None else held
     dt, t, at = 1 / RATE, 0.0, np.zeros(3)
 
     def read(x: Array) -> Array:
@@ -186,6 +178,7 @@ def elasticity(seeds: int = 4, pose_noises: tuple[float, ...] = (0.1, 0.2)) -> I
                             path=run.path,
                             holds=run.holds,
                             drift_order=8,
+                            pose_noise_from_residuals=True,
                         )
                     )
                     times.append(1e3 * (time.perf_counter() - begin))

@@ -30,10 +30,13 @@ from mechanics.task_plane import TaskPlane
 LOOKS = 20
 #: how far a via point lies off, as a share of the amplitudes, and which holds are long ones
 VIA, LONG = 0.5, 20
+#: the shortest displacement along an axis, as a share of its amplitude: a shorter one is mostly noise
+SHORTEST = 0.5
 #: what a tare leaves of the wrist sensor's drift while the samples are taken, 1 sigma [N, N, N·m], and the order of
 #: the polynomial in time that it may follow
 DRIFT, DRIFT_ORDER = (0.02, 0.02, 0.004), 8
-#: how well the arm repeats itself, 1 sigma of a hold [m, m, rad]: what the makers of such arms warrant
+#: how well the arm repeats itself, 1 sigma of a hold [m, m, rad]: what the makers of such arms warrant. The fit begins
+#: with it; how well this arm does shows in the residuals
 POSE_NOISE = (1e-4, 1e-4, np.radians(0.1))
 
 
@@ -70,6 +73,7 @@ def elasticity_stage(context: RunContext, stage: ElasticityStage) -> None:
             path=samples.path,
             holds=samples.holds,
             drift_order=DRIFT_ORDER,
+            pose_noise_from_residuals=True,
         )
     amplitude = float(np.sqrt(np.mean(size(fit.stiffness, samples.x - fit.offset) ** 2)))
     found = ElasticityCalibration(
@@ -109,22 +113,35 @@ def amplitudes(stage: ElasticityStage, stiffness: Array) -> Array:
     return np.maximum(usual / np.diag(stiffness), np.minimum(least, most / np.diag(stiffness)))
 
 
+def shares(samples: int, rng: np.random.Generator) -> Array:
+    """The holds (n, 3) over the amplitudes of x, y and θ: a third along one axis, the rest at random, in mixed order.
+
+    Along each axis they are at least `SHORTEST`, or nothing.
+    """
+    held = rng.uniform(SHORTEST, 1, (samples, 3)) * rng.choice((-1, 1), (samples, 3))
+    axial = np.arange(samples // 3)
+    held[axial] *= np.eye(3)[axial % 3]
+    return rng.permutation(held)
+
+
 def schedule(stage: ElasticityStage, stiffness: Array, rng: np.random.Generator) -> tuple[Array, Array]:
     """Displacements (n, 3) [m, m, rad] of the holds in their order, and the via point (n, 3) before each.
 
     The via points take every side, so that what the membrane remembers does not go with where it is.
     """
     scale = amplitudes(stage, stiffness)
-    along = np.zeros((stage.samples // 3, 3))
-    along[np.arange(len(along)), np.arange(len(along)) % 3] = rng.uniform(-1, 1, len(along))
-    holds = rng.permutation(np.concatenate([along, rng.uniform(-1, 1, (stage.samples - len(along), 3))])) * scale
+    holds = shares(stage.samples, rng) * scale
     direction = rng.standard_normal(holds.shape)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     return holds, holds + VIA * direction * scale
 
 
 def sampled(rig: Rig, stage: ElasticityStage, rng: np.random.Generator) -> ElasticitySamples:
-    """Go through the schedule and measure. Ends with the object free in the fingers again."""
+    """Go through the schedule and measure. Ends with the object free in the fingers again.
+
+    The displacements lie about where the fingers are when the object is fixed, which is where it hangs in them freely:
+    about the grasp that was meant, an object that lies otherwise in the fingers would be pushed much harder one way.
+    """
     context, observer, clock = rig.context, rig.observer, rig.devices.clock
     what = context.resolved.grasped.name
     rig.regrasp(0)
@@ -134,13 +151,14 @@ def sampled(rig: Rig, stage: ElasticityStage, rng: np.random.Generator) -> Elast
     observer.zero(setup.free_air_load(context.resolved), seen.pose)
     way = [(clock.now_ns(), rig.mover.pose)]
     rig.clamp("go", what)
+    free = rig.mover.pose
     X_W_gocf = se2.compose(_looked(rig), observer.grasp)
     x, w, covariances, times, numbers = [], [], [], [], []
     holds, vias = schedule(stage, context.believed.stiffness, rng)
 
     def move(target: Array) -> None:
         way.append((clock.now_ns(), rig.mover.pose))
-        rig.mover.ramp(se2.compose(X_W_gocf, target), stage.ramp)
+        rig.mover.ramp(se2.compose(free, target), stage.ramp)
         way.append((clock.now_ns(), rig.mover.pose))
 
     def read(number: int) -> None:
@@ -162,7 +180,7 @@ def sampled(rig: Rig, stage: ElasticityStage, rng: np.random.Generator) -> Elast
             read(number)
             advance()
     way.append((clock.now_ns() + 1, rig.mover.pose))
-    rig.mover.ramp(se2.compose(X_W_gocf, np.zeros(3)), 0.5)
+    rig.mover.ramp(free, 0.5)
     rig.free(what)
     rig.rest(0.5)
     held = np.array(numbers)

@@ -45,11 +45,11 @@ class ForceTorqueStage(_Model):
 class ElasticityStage(_Model):
     """Identify K: the object is fixed to the table, the fingers are moved about it (the paper's protocol).
 
-    A third of the samples lie along the axes, the rest at random within the amplitudes, in mixed order: amplitudes are
-    what makes ``force`` and ``torque`` by the stiffness that is believed beforehand. Fingers so stiff that the arm's
-    own error would drown that are moved by ``least_mm`` and ``least_deg``, or as far as ``most_force`` and
-    ``most_torque`` allow. Each sample comes from another side (a via point), and the wrench is read twice in a hold:
-    what differs is creep.
+    A third of the samples lie along the axes, the rest at random, each axis between half and all of its amplitude, in
+    mixed order, about where the object hangs freely in the fingers. Amplitudes are what makes ``force`` and ``torque``
+    by the stiffness that is believed beforehand. Fingers so stiff that the arm's own error would drown that are moved
+    by ``least_mm`` and ``least_deg``, or as far as ``most_force`` and ``most_torque`` allow. Each sample comes from
+    another side (a via point), and the wrench is read twice in a hold: what differs is creep.
     """
 
     stage: Literal["calibrate_elasticity"]

@@ -102,6 +102,25 @@ def test_the_uncertainty_of_every_entry_is_honest():
     assert np.mean(np.abs(z) < 1.96) == pytest.approx(0.95, abs=0.04)
 
 
+def test_pose_noise_other_than_believed_shows_in_the_residuals_and_sets_the_weights():
+    """Poses good to 0.05 mm and 0.3° where 0.2 mm and 0.05° are believed: given away, and taken from the residuals."""
+    believed, true = noise_of(0.2) * (1, 1, 1 / 16), np.diag([5e-5, 5e-5, np.radians(0.3)]) ** 2
+    errors, chi2 = {False: [], True: []}, []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        x = spread(rng)
+        w = x @ K + rng.multivariate_normal(np.zeros(3), W_NOISE, len(x))
+        seen = x + rng.multivariate_normal(np.zeros(3), true, len(x))
+        for ask in (False, True):
+            fit = fit_elasticity(
+                seen, w, x_covariance=believed, w_covariance=W_NOISE, stiffening=False, pose_noise_from_residuals=ask
+            )
+            errors[ask].append((fit.stiffness - K) / SCALE)
+        chi2.append(fit.chi2)
+    assert np.mean(chi2) == pytest.approx(1.0, abs=0.1)
+    assert np.std(errors[True]) < 0.8 * np.std(errors[False])
+
+
 def stiffened(x, a):
     return (1 + a * np.sqrt(np.einsum("ni,ij,nj->n", x, K, x) * 2 / (K[0, 0] + K[1, 1])))[:, None] * (x @ K)
 
@@ -177,7 +196,7 @@ def found_errors(nominal, seed, pose):
     run = session(nominal, seed, pose_noise=pose)
     fit = fit_elasticity(
         run.x, run.w, x_covariance=noise_of(pose), w_covariance=np.diag([0.02, 0.02, 0.004]) ** 2,
-        times=run.times, path=run.path, holds=run.holds, drift_order=8,
+        times=run.times, path=run.path, holds=run.holds, drift_order=8, pose_noise_from_residuals=True,
     )  # fmt: skip
     amplitude = float(np.sqrt(np.mean(size(run.K, run.true_x) ** 2)))
     diagonal = np.diag(fit.secant(amplitude)) / np.diag(run.secant(amplitude)) - 1

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.calibrate.elasticity import amplitudes
+from experiments.calibrate.elasticity import amplitudes, schedule
 from experiments.calibrate.schema import ElasticityStage
 from mechanics.catalogue import load_sensor
 
@@ -36,3 +36,18 @@ def test_no_least_is_asked_where_it_is_zero():
     stage = ElasticityStage(stage="calibrate_elasticity", least_mm=0.0, least_deg=0.0)
     stiffness = np.diag([5000.0, 10000.0, 40.0])
     np.testing.assert_allclose(amplitudes(stage, stiffness), [6 / 5000, 6 / 10000, 0.2 / 40])
+
+
+def test_a_third_of_the_holds_lie_along_one_axis_and_none_is_short():
+    stage = ElasticityStage(stage="calibrate_elasticity", samples=90)
+    stiffness = load_sensor("soft_bubble").stiffness
+    holds, vias = schedule(stage, stiffness, np.random.default_rng(3))
+    shares = np.abs(holds) / amplitudes(stage, stiffness)
+    axial = (shares > 0).sum(axis=1) == 1
+    assert axial.sum() == 30
+    np.testing.assert_array_equal((shares[axial] > 0).sum(axis=0), [10, 10, 10])
+    assert shares[shares > 0].min() >= 0.5
+    assert shares.max() <= 1.0
+    octants = np.unique(np.sign(holds[~axial]), axis=0)
+    assert len(octants) == 8  # every direction is gone to
+    assert vias.shape == holds.shape
