@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers import tag_edges
 from drivers.errors import NotConnected
 from mechanics.camera import CameraModel
 from mechanics.readings import Array, TagDetection
 
 Image = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 Region = tuple[int, int, int, int]
 
 # Cells across the black square, and OpenCV's name of the same code.
@@ -29,7 +29,7 @@ _FAMILIES = {
     "tag16h5": (6, "DICT_APRILTAG_16h5"),
 }
 _PASSES, _SETTLED = 5, 0.01  # of the refinement; it ends when no corner moved by more than that [px]
-_FAINTEST = 8.0  # grey levels between black and white, below which there is no edge
+_ROOM, _NEAR = 0.3, 0.15  # of a tag's size: so far around it `track` looks for it again, and so far it may have gone
 _SMALLEST_REGION = 16  # px; the library needs a few of its 4 px tiles
 _APRILTAG_ORIGIN = 0.5  # px; the library puts pixel centres at half-integers
 
@@ -71,11 +71,14 @@ class TagDetector:
     ):
         import pupil_apriltags
 
+        if refine:
+            tag_edges.warm()  # a picture is waited for with less patience than a detector
         self.family = family
         self._cells = _family(family)[0]
         self._decimate, self._refine, self._max_hamming = decimate, refine, max_hamming
         self._camera = camera
         self._lock = threading.Lock()
+        self._seen: dict[int, TagDetection] = {}  # by `track`, in its last picture
         # The library's own edge refinement pays only where the search image is smaller than the picture: at full size
         # it moves corners by half a pixel and loses small tags. The binding rounds the sharpening down to none.
         self._library: Any = pupil_apriltags.Detector(
@@ -116,6 +119,29 @@ class TagDetector:
             found = [TagDetection(d.id, c, d.hamming, d.margin) for d, c in zip(found, corners, strict=True)]
         return tuple(sorted(found, key=lambda d: (d.id, *d.corners[0])))
 
+    def track(self, image: Image, ids: Collection[int]) -> tuple[TagDetection, ...]:
+        """Tags in ``image`` as `detect` finds them, looked for first where each of ``ids`` was seen last.
+
+        Where one of them is not found again, or the others are not these alone, nobody knows what has changed: then the
+        whole picture is searched. So name all the tags that may be in view: any other may be overlooked.
+        """
+        found = self._again(image, ids) or self.detect(image)
+        self._seen = {d.id: d for d in found}
+        return found
+
+    def _again(self, image: Image, ids: Collection[int]) -> tuple[TagDetection, ...]:
+        """The tags ``ids`` near where they were, or nothing."""
+        last = self._seen
+        if not all(id in last for id in ids):
+            return ()
+        found = self.detect(image, regions_around([last[id] for id in ids], _ROOM))
+        there = sorted(d.id for d in found) == sorted(ids) and all(_stayed(d, last[d.id]) for d in found)
+        return found if there else ()
+
+    def forget(self) -> None:
+        """What `track` has seen until now tells nothing of the next picture."""
+        self._seen = {}
+
     def close(self) -> None:
         """Free the library's detector; idempotent. It also goes with this object, and at exit."""
         with self._lock:
@@ -143,6 +169,9 @@ def refine_corners(
     intersected. A tag that is too small, or has an edge that cannot be seen, or would move by more than ``max_shift``
     pixels keeps its rough corners.
     """
+    # one kind of array, whoever made it: for each the loops would be compiled anew
+    image = np.ascontiguousarray(image).view()
+    image.setflags(write=False)
     corners = np.asarray(corners, float)
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
     reach = np.minimum(0.45 * sides.min(axis=1) / cells, 3.0)
@@ -162,84 +191,27 @@ def refine_corners(
 
 def _refine_once(image: Image, corners: Array, reach: Array, camera: CameraModel | None) -> Array:
     """One pass over corners (n, 4, 2); NaN where a tag's edges cannot be seen."""
-    start, end = corners, np.roll(corners, -1, axis=1)
-    length = np.linalg.norm(end - start, axis=-1)
-    along = (end - start) / length[..., None]
-    # Corners run counter-clockwise as seen, so in pixel axes (y down) the outside lies on this side.
-    outward = np.stack((-along[..., 1], along[..., 0]), axis=-1)
-
+    start, along, length = _edges(corners)
     count = int(np.clip(np.ceil(length.max()), 16, 128))
-    margin = (reach[:, None] + 1.0)[..., None]
-    t = margin + (length[..., None] - 2 * margin) * (np.arange(count) + 0.5) / count  # (n, 4, count)
-    n_steps = int(np.ceil(reach.max() / 0.25))
-    step = 2 * reach / n_steps
-    # Shifting each profile by a part of a step keeps an edge that runs along the pixel grid from a common rounding.
-    shift = step[:, None] * (np.modf(np.arange(count) * 0.6180339887)[0] - 0.5)
-    middle = step[:, None] * (np.arange(n_steps) + 0.5) - reach[:, None]
-    s = (middle[:, None, :] + shift[..., None])[:, None]  # (n, 1, count, n_steps)
-    foot = start[..., None, :] + t[..., None] * along[..., None, :]
-    grey, inside = _bilinear(image, foot[..., None, :] + s[..., None] * outward[..., None, None, :])
-
-    ends = max(1, n_steps // 6)
-    valid: Mask = np.asarray(inside.all(axis=-1))
-    black, valid = _level(t, grey[..., :ends].mean(axis=-1), valid, 2.0)
-    white, valid = _level(t, grey[..., -ends:].mean(axis=-1), valid, 2.0)
-    contrast = white - black
-    with np.errstate(divide="ignore", invalid="ignore"):
-        filled = (grey - black[..., None]).sum(axis=-1) / contrast
-        offset = (reach[:, None] + shift)[:, None] - step[:, None, None] * filled
-    valid &= (contrast > _FAINTEST) & (np.abs(offset) < reach[:, None, None])
-    offset = np.where(valid, offset, 0.0)
-    points = foot + offset[..., None] * outward[..., None, :]
+    steps = int(np.ceil(reach.max() / 0.25))
+    points, valid = np.empty((*length.shape, count, 2)), np.empty((*length.shape, count), bool)
+    tag_edges.edge_points(image, start, along, length, reach, steps, points, valid)
     if camera is not None:
-        points, start, end = camera.undistort(points), camera.undistort(start), camera.undistort(end)
-        along = (end - start) / np.linalg.norm(end - start, axis=-1)[..., None]
-        outward = np.stack((-along[..., 1], along[..., 0]), axis=-1)
-
-    relative = points - start[..., None, :]
-    t, r = (np.einsum("nekc,nec->nek", relative, axis) for axis in (along, outward))
-    _, valid = _level(t, r, valid, 0.01)
+        points = camera.undistort(points)
+        start, along, _ = _edges(camera.undistort(corners))
+    origin, direction = np.empty_like(start), np.empty_like(start)
+    tag_edges.edge_lines(points, valid, start, along, origin, direction)
     enough = (valid.mean(axis=-1) > 0.4).all(axis=-1)
-    at_start, slope = _line(t, r, valid)
-    direction = along + slope[..., None] * outward
-    origin = start + at_start[..., None] * outward
     out = _intersections(origin, direction)
     out[~enough] = np.nan
     return out if camera is None else camera.distort(out)
 
 
-def _line(t: Array, y: Array, valid: Mask) -> tuple[Array, Array]:
-    """Least-squares value at t = 0 and slope of y(t) along the last axis, over the valid samples."""
-    n = np.maximum(valid.sum(axis=-1), 1)
-    mean_t, mean_y = np.where(valid, t, 0).sum(axis=-1) / n, np.where(valid, y, 0).sum(axis=-1) / n
-    dt = np.where(valid, t - mean_t[..., None], 0.0)
-    spread = (dt * dt).sum(axis=-1)
-    slope = (dt * np.where(valid, y, 0)).sum(axis=-1) / np.where(spread > 0, spread, 1.0)
-    return mean_y - slope * mean_t, slope
-
-
-def _level(t: Array, y: Array, valid: Mask, floor: float) -> tuple[Array, Mask]:
-    """The straight line through y(t) at every t, and which of the valid samples it rests on.
-
-    Four rounds drop what lies beyond three median distances (outliers on a fifth of an edge pull the line, but not
-    that far); then everything within six comes back, since noise alone would have been trimmed as well. Nothing within
-    ``floor`` is dropped.
-    """
-    kept = valid
-    for factor in (3.0, 3.0, 3.0, 3.0, 6.0):
-        distance, _ = _distance(t, y, kept)
-        ranked = np.sort(np.where(kept, distance, np.inf), axis=-1)
-        half = np.maximum(kept.sum(axis=-1, keepdims=True) - 1, 0) // 2
-        limit = np.maximum(factor * np.take_along_axis(ranked, half, axis=-1), floor)
-        kept = (valid if factor > 3 else kept) & (distance <= limit)
-    return _distance(t, y, kept)[1], kept
-
-
-def _distance(t: Array, y: Array, valid: Mask) -> tuple[Array, Array]:
-    """How far each sample lies from the line through the valid ones, and that line at every t."""
-    at_zero, slope = _line(t, y, valid)
-    fit = at_zero[..., None] + slope[..., None] * t
-    return np.abs(y - fit), fit
+def _edges(corners: Array) -> tuple[Array, Array, Array]:
+    """Edges from each corner (n, 4, 2) to the next: where they begin, unit vectors along them, and lengths (n, 4)."""
+    sides = np.roll(corners, -1, axis=1) - corners
+    length = np.linalg.norm(sides, axis=-1)
+    return np.ascontiguousarray(corners), sides / length[..., None], length
 
 
 def _intersections(origin: Array, direction: Array) -> Array:
@@ -252,24 +224,16 @@ def _intersections(origin: Array, direction: Array) -> Array:
     return o0 + s[..., None] * d0
 
 
-def _bilinear(image: Image, points: Array) -> tuple[Array, Mask]:
-    """Grey values (...) at points (..., 2) [px], and whether they lie in the image (at its border's value if not)."""
-    height, width = image.shape
-    x, y = points[..., 0], points[..., 1]
-    inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-    x, y = (np.nan_to_num(np.clip(v, 0, limit)) for v, limit in ((x, width - 1), (y, height - 1)))
-    column, row = np.minimum(x.astype(np.intp), width - 2), np.minimum(y.astype(np.intp), height - 2)
-    fx, fy = x - column, y - row
-    flat, at = image.ravel(), row * width + column
-    upper = flat[at] * (1 - fx) + flat[at + 1] * fx
-    lower = flat[at + width] * (1 - fx) + flat[at + width + 1] * fx
-    return upper * (1 - fy) + lower * fy, inside
-
-
 def _family(name: str) -> tuple[int, str]:
     if name not in _FAMILIES:
         raise ValueError(f"unknown tag family {name!r}; expected one of {', '.join(_FAMILIES)}")
     return _FAMILIES[name]
+
+
+def _stayed(now: TagDetection, before: TagDetection) -> bool:
+    """Whether a tag is near where it was: one that the border of its region cuts off can be read, but not measured."""
+    size = float(np.ptp(before.corners, axis=0).max())
+    return float(np.abs(now.corners - before.corners).max()) < _NEAR * size
 
 
 def _clipped(region: Region, width: int, height: int) -> Region:

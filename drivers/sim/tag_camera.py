@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from drivers.config import TagCameraConfig
 from drivers.interfaces import Description, TagCamera
 from drivers.scene import TagMount
+from drivers.sim import area_coverage
 from drivers.sim.camera_errors import actual, calibrated, exposed
 from drivers.sim.faults import Faulty, received
 from drivers.sim.mismatch import CameraFigures
 from drivers.sim.screen import Screen
 from drivers.tags import TagDetector, tag_bitmap
 from mechanics.camera import CameraModel, point_in_world
-from mechanics.readings import Array, ImageReading, Stamp, TagReading
+from mechanics.readings import Array, ImageReading, Stamp, TagDetection, TagReading
 from mechanics.se2 import transform
 from mechanics.tag_board import TagBoard
 
@@ -67,14 +68,15 @@ class TagWorld(Protocol):
 class TagRenderer:
     """Draws tags as a camera sees them: each pixel is the mean over its square, exactly.
 
-    Every boundary between a black and a white cell is cut at the pixel grid and its signed area summed along the rows
-    (Green's theorem), so that an edge lies in the picture where it lies in the world, to the rounding of grey levels.
+    Every boundary between a black and a white cell is cut at the pixel grid (`drivers.sim.area_coverage`), so that an
+    edge lies in the picture where it lies in the world, to the rounding of grey levels.
     Under lens distortion a cell's edge is drawn as a chord of four.
     """
 
     def __init__(self, camera: CameraModel):
         self.camera = camera
         self._pieces = 4 if camera.distortion.any() else 1
+        area_coverage.warm()  # a picture is waited for with less patience than a camera
 
     def render(
         self,
@@ -122,12 +124,13 @@ class TagRenderer:
         printed = float(R[:, 2] @ (self.camera.X_WC[:3, 3] - origin)) > 0
         if not printed:
             outline = outline[::-1]
-        self._blend(grey, outline, np.roll(outline, -1, axis=0), np.array([[_WHITE], [1.0]]) * np.ones(len(outline)))
+        ones = np.ones(len(outline))
+        self._blend(grey, outline, np.roll(outline, -1, axis=0), _WHITE * ones, ones)
         for id in board.ids if printed else ():
             start, end, level, cover = _boundaries(id, self._pieces)
             nodes = np.stack((start, end)) * (board.size / 8) + board.centre(id)
             pixels = self.camera.project(nodes @ R[:, :2].T + origin)
-            self._blend(grey, pixels[0], pixels[1], np.stack((level, cover)))
+            self._blend(grey, pixels[0], pixels[1], level, cover)
 
     def _cover(self, grey: Array, screen: Screen) -> None:
         p_W = transform(np.asarray(screen.X_W, float), screen.corners)
@@ -135,8 +138,8 @@ class TagRenderer:
         if not np.isfinite(corners).all():
             return  # behind the camera
         outline = cv2.convexHull(corners.astype(np.float32), clockwise=True)[:, 0].astype(float)
-        ends = np.roll(outline, -1, axis=0)
-        self._blend(grey, outline, ends, np.array([[_FINGER], [1.0]]) * np.ones(len(outline)))
+        ones = np.ones(len(outline))
+        self._blend(grey, outline, np.roll(outline, -1, axis=0), _FINGER * ones, ones)
 
     def _draw(self, grey: Array, mount: TagMount, X_W_body: Array) -> None:
         start, end, level, cover = _boundaries(mount.id, self._pieces)
@@ -145,23 +148,17 @@ class TagRenderer:
         pixels = self.camera.project(point_in_world(p_W, mount.height))
         if not np.isfinite(pixels).all():
             return  # behind the camera
-        self._blend(grey, pixels[0], pixels[1], np.stack((level, cover)))
+        self._blend(grey, pixels[0], pixels[1], level, cover)
 
     @staticmethod
-    def _blend(grey: Array, start: Array, end: Array, jumps: Array) -> None:
-        """Lay a shape over the picture whose level and cover rise by ``jumps`` (2, n) across segments (n, 2) [px]."""
+    def _blend(grey: Array, start: Array, end: Array, level: Array, cover: Array) -> None:
+        """Lay a shape over the picture whose level and cover rise by so much (n,) across segments (n, 2) [px]."""
         height, width = grey.shape
         pixels = np.stack((start, end))
         low = np.maximum(np.floor(pixels.min(axis=(0, 1)) + 0.5).astype(int), 0)
         high = np.minimum(np.floor(pixels.max(axis=(0, 1)) + 0.5).astype(int) + 1, (width, height))
-        if (low >= high).any():
-            return
-        (x0, y0), (x1, y1) = low, high
-        shifted = pixels + 0.5 - low  # pixel (i, j) of the window covers [j, j + 1] × [i, i + 1]
-        value, alpha = _coverage(shifted[0], shifted[1], jumps, y1 - y0, x1 - x0)
-        window = grey[y0:y1, x0:x1]
-        window *= 1 - alpha
-        window += value
+        if (low < high).all():
+            area_coverage.lay(grey, *pixels, *np.array((level, cover)), *low.tolist(), *high.tolist())
 
 
 class SimTagCamera(Faulty[TagReading], TagCamera):
@@ -212,7 +209,7 @@ class SimTagCamera(Faulty[TagReading], TagCamera):
         stamp = Stamp(now, now, self._sequence, self.name, status)
         self._sequence += 1
         self._image = ImageReading(stamp, picture, "mono8")
-        reading = TagReading(stamp, self._detector.detect(picture), self._detector.family)
+        reading = TagReading(stamp, self._found(self._detector, picture), self._detector.family)
         if figures.latency:
             reading = received(reading, now + round(figures.latency * 1e9))
         return self._hand_out(reading, timeout)
@@ -238,8 +235,10 @@ class SimTagCamera(Faulty[TagReading], TagCamera):
         self._image = None
 
     def begin_trial(self, rng: np.random.Generator) -> None:
-        """Noise and losses from ``rng`` from now on, of the same camera."""
+        """Noise and losses from ``rng`` from now on, of the same camera, whatever it has seen before."""
         self._rng = rng
+        if self._detector is not None:
+            self._detector.forget()
 
     def _equip(self) -> None:
         """The camera that this lab has, by the profile and the epoch's random numbers."""
@@ -260,6 +259,12 @@ class SimTagCamera(Faulty[TagReading], TagCamera):
             at = [(mount, X_W + t * moving[mount.id] if mount.id in moving else X_W) for mount, X_W in tags]
             pictures.append(render.paint(at, screens, self._board))
         return np.mean(pictures, axis=0)
+
+    def _found(self, detector: TagDetector, picture: NDArray[np.uint8]) -> tuple[TagDetection, ...]:
+        """The tags in the picture; the whole of it is searched where one is missing, or a board is shown."""
+        if self._board is not None:
+            return detector.detect(picture)
+        return detector.track(picture, {mount.id for mount, _ in self._world.visible_tags()})
 
     def _smear(self, twist: Array) -> float:
         """Speed in the picture [px/s] of a tag at most 0.1 m from its body's origin."""
@@ -312,34 +317,3 @@ def _boundaries(id: int, pieces: int) -> tuple[Array, Array, Array, Array]:
     for array in arrays:
         array.setflags(write=False)
     return arrays
-
-
-def _coverage(start: Array, end: Array, jumps: Array, height: int, width: int) -> Array:
-    """Pictures (m, height, width) whose values rise by ``jumps`` (m, n) across directed segments (n, 2) → (n, 2).
-
-    Each pixel [j, j + 1] × [i, i + 1] is the exact mean over its square.
-    """
-    delta = end - start
-    cuts = [np.zeros((len(start), 1)), np.ones((len(start), 1))]
-    for axis in (0, 1):
-        low = np.minimum(start[:, axis], end[:, axis])
-        lines = np.floor(low)[:, None] + 1 + np.arange(int(np.ceil(np.abs(delta[:, axis]).max())) + 1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            t = (lines - start[:, axis, None]) / delta[:, axis, None]
-        cuts.append(np.clip(np.nan_to_num(t, nan=1.0, posinf=1.0, neginf=1.0), 0.0, 1.0))
-    t = np.sort(np.concatenate(cuts, axis=1), axis=1)
-    at = 0.5 * (t[:, 1:] + t[:, :-1])
-    drop = (t[:, 1:] - t[:, :-1]) * delta[:, 1, None]  # signed height of each piece, which lies within one pixel
-    x = start[:, 0, None] + at * delta[:, 0, None]
-    row = np.floor(start[:, 1, None] + at * delta[:, 1, None]).astype(np.intp)
-    x = np.clip(x, 0.0, width)  # what lies left of the window still covers all of its row, what lies right nothing
-    column = np.minimum(x.astype(np.intp), width)
-    right = drop * (x - column)
-    keep = (row >= 0) & (row < height) & (drop != 0)
-    index = (row * (width + 2) + column)[keep]
-    out = np.empty((len(jumps), height, width))
-    for picture, jump in zip(out, jumps, strict=True):
-        here, beyond = ((jump[:, None] * part)[keep] for part in (drop - right, right))
-        total = np.bincount(index, here, height * (width + 2)) + np.bincount(index + 1, beyond, height * (width + 2))
-        picture[:] = np.cumsum(total.reshape(height, width + 2), axis=1)[:, :width]
-    return out

@@ -136,6 +136,39 @@ def test_only_the_regions_asked_for_are_searched() -> None:
     assert detector.detect(image, regions=[(500, 500, 600, 600), (3, 3, 9, 9)]) == ()
 
 
+def test_tracking_finds_a_tag_near_where_it_was_and_one_that_has_jumped_away() -> None:
+    detector = TagDetector()
+    for columns in (51, 60, 200, 51):
+        tags = (7, columns, 60), (2, 320, 93)
+        found = detector.track(picture(*tags, shape=(240, 480)), {7, 2})
+        assert [d.id for d in found] == [2, 7]
+        np.testing.assert_allclose(found[1].corners, square(columns, 60, 96), atol=0.01)
+
+
+def test_tracking_sees_a_tag_that_comes_into_view_later_or_comes_back() -> None:
+    both, one = picture((7, 51, 60), (2, 240, 93)), picture((7, 51, 60), shape=picture((2, 240, 93)).shape)
+    detector = TagDetector()
+    seen = [[d.id for d in detector.track(image, {7, 2})] for image in (one, one, both, one, both)]
+    assert seen == [[7], [7], [2, 7], [7], [2, 7]]
+
+
+def test_tracking_measures_a_tag_that_its_region_would_cut_off() -> None:
+    for step in range(20, 70, 5):  # the region ends 29 px beyond the tag
+        detector = TagDetector(decimate=1.0, refine=False)
+        detector.track(picture((7, 51, 60)), {7})
+        image = picture((7, 51 + step, 60))
+        (tag,), (expected,) = detector.track(image, {7}), detector.detect(image)
+        np.testing.assert_allclose(tag.corners, expected.corners, atol=0.5)
+
+
+def test_tracking_that_has_forgotten_searches_the_whole_picture() -> None:
+    detector, both = TagDetector(), picture((7, 51, 60), (2, 240, 93))
+    detector.track(both, {7})
+    assert [d.id for d in detector.track(both, {7})] == [7]
+    detector.forget()
+    assert [d.id for d in detector.track(both, {7})] == [2, 7]
+
+
 def test_a_region_around_a_detection_holds_its_margin() -> None:
     (tag,) = TagDetector().detect(picture((5, 60, 60)))
     assert regions_around([tag], margin=0.5) == [(11, 11, 205, 205)]
