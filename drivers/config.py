@@ -65,6 +65,8 @@ class BusConfig(Strict):
     tls: TlsConfig | None = None
     insecure: bool = Field(default=False, description="whoever reaches the endpoint may command the arm")
     timeout: float = Field(default=5.0, gt=0, description="longest wait for a reply [s]")
+    view_rate: float = Field(default=20.0, gt=0, le=100, description="readings per second for who looks on [Hz]")
+    image_view_rate: float = Field(default=5.0, gt=0, le=60, description="and pictures [Hz]")
     lease: float | None = Field(
         default=None,
         gt=0,

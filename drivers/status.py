@@ -1,6 +1,8 @@
 """Whether every device of a station is alive, how fast it speaks, and what it says of itself.
 
-Looking disturbs nothing: no process is started, no lease is taken, nothing is commanded.
+Looking disturbs nothing: no process is started, no lease is taken, nothing is commanded. For its second it takes the
+streams themselves: a view tells neither a stream's rate nor its gaps, and of a camera that nobody else hears only the
+view's own rate. Whoever looks on for longer takes the views (`drivers.wire.topics.view`).
 """
 
 from __future__ import annotations

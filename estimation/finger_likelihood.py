@@ -211,7 +211,7 @@ class _Likelihood:
         mean, away = samples.split(r)
         J = J[samples.first] if len(J) > 1 else J
         S = samples.w_covariance / samples.count[:, None, None] + J @ x_covariance @ J.swapaxes(-1, -2)
-        root = np.linalg.cholesky(S)
+        root = np.asarray(np.linalg.cholesky(S), float)
         inverse_mean, inverse_w = np.linalg.inv(root), self._inverse_w
         white = np.concatenate([np.einsum("gij,gj->gi", inverse_mean, mean).ravel(), (away @ inverse_w.T).ravel()])
         if samples.drift.shape[1]:

@@ -176,19 +176,28 @@ def repair(
 
 @command("extrinsic bench sim --check")
 def bench(
-    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="Which benchmark: sim, estimation, planning.")],
-    runs: Annotated[int, typer.Option("--runs", min=1, help="Measurements per figure; the median counts.")] = 5,
+    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="Which benchmark: sim, estimation, planning, load.")],
+    runs: Annotated[
+        int | None, typer.Option("--runs", min=1, help="Measurements per figure, 5; the median counts. Not of `load`.")
+    ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write BENCHMARK.json into DIR.")] = None,
     check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
     horizons: Annotated[
         str | None, typer.Option("--horizons", metavar="K,...", help="Steps of the problems of `planning`.")
     ] = None,
+    minutes: Annotated[
+        float | None, typer.Option("--minutes", min=0.1, max=10_000, help="How long `load` runs in real time; 20.")
+    ] = None,
+    viewers: Annotated[
+        int | None, typer.Option("--viewers", min=1, max=100, help="Who looks on, now and then, in `load`; 4.")
+    ] = None,
 ) -> None:
-    """Measure speed and accuracy, figure beside target, in one run."""
+    """Measure speed, accuracy and steadiness, figure beside target, in one run."""
     from experiments import bench as benchmarks
 
-    raise typer.Exit(benchmarks.main(name, runs, json_file, out, check_targets, _horizons(horizons)))
+    options = benchmarks.Options(runs, _horizons(horizons), minutes, viewers)
+    raise typer.Exit(benchmarks.main(name, options, json_file, out, check_targets))
 
 
 @command("extrinsic sweep grasped_static --grid world.stiffness_scale=0.8,1,1.2 --seeds 0-4 --set world.profile=lab")

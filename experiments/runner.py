@@ -221,7 +221,7 @@ def _last_words(context: RunContext) -> str:
 
 
 def _accounts(context: RunContext) -> dict[str, Any]:
-    """What was logged beside what was published, per topic; ``lost`` is the difference."""
+    """What was logged beside what was published, per topic; ``lost`` is the difference, ``gaps`` what never came."""
     published: Mapping[str, int] = {}
     devices, log = context.opened, context.log
     try:
@@ -232,7 +232,7 @@ def _accounts(context: RunContext) -> dict[str, Any]:
         pass
     logged = log.counts
     lost = sum(max(0, count - logged.get(topic, 0)) for topic, count in published.items()) + log.overflows
-    return {"file": log.path.name, "messages": logged, "published": published, "lost": lost}
+    return {"file": log.path.name, "messages": logged, "published": published, "lost": lost, "gaps": dict(log.gaps)}
 
 
 def _finish(outcome: Outcome, console: Console) -> Outcome:

@@ -39,6 +39,7 @@ from drivers.wire.bus import Bus
 from drivers.wire.codec import encode_reading
 from drivers.wire.server import Answer, Desk, DeviceServer, Work
 from drivers.wire.station_bus import station_bus, warn_unheard
+from drivers.wire.streams import ViewRates
 
 PROTOCOL = 2
 TRUTH_PERIOD_NS = 20_000_000
@@ -114,6 +115,7 @@ class Host:
             shift_ns=lambda: self.skipped_ns,
             lockstep=self.world.lockstep,
             lease=config.lease,
+            views=ViewRates(config.bus.view_rate, config.bus.image_view_rate),
         )
         self._stopping = False
         self._staged = False
@@ -204,15 +206,22 @@ class Host:
             self._anchor += behind
             self.skipped_ns += int(behind * 1e9)
             log.warning("%s: the world was %.0f ms late and gave up the lost time", self.config.name, behind * 1e3)
-            behind = 0.0
+            behind = _PIECE  # the sensors speak before anybody hears that so much time has passed
         if behind < _PIECE:
             return _PIECE - behind
         self._step(int(_PIECE * 1e9))
-        for name, server in self._servers.items():
-            if isinstance(server.device, ImagingSensor) and simulated >= self._due.get(name, 0.0):
-                self._due[name] = simulated + 1.0 / self.config.devices[name].rate
-                server.capture_if_wanted()
+        self._capture(simulated)
         return 0.0
+
+    def _capture(self, now: float) -> None:
+        """Have the camera take its frame whose frame is due longest: one at a time, for commands wait meanwhile."""
+        cameras = [name for name, server in self._servers.items() if isinstance(server.device, ImagingSensor)]
+        name = min(cameras, key=lambda camera: self._due.get(camera, 0.0), default=None)
+        if name is None or (due := self._due.get(name, 0.0)) > now:
+            return
+        period = 1.0 / self.config.devices[name].rate
+        self._due[name] = due + period if due + period > now else now + period  # what was missed is not made up for
+        self._servers[name].capture_if_wanted()
 
     def _step(self, span_ns: int) -> None:
         """Advance by ``span_ns``, with the truth at its instants and urgent work no longer than its period away."""
@@ -259,6 +268,8 @@ class Host:
             raise CommandRefused(topics.WORLD, "reset", str(error), "Correct the scene") from error
         self.skipped_ns = 0
         self._origin_ns, self._anchor = self.world.now_ns(), time.monotonic()
+        if not self.world.lockstep:  # what the reset itself has taken is not to make every reading old
+            self.skipped_ns = time.time_ns() - self._origin_ns
         self._truths, self._staged = 0, True
         self._staged_anew()
 

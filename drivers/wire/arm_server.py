@@ -73,7 +73,7 @@ class ArmServer(DeviceServer):
             if isinstance(sensor, int | float):
                 self._hear(name)
             else:
-                self._stops.append(sensor.listen(partial(self._felt, name)))
+                self._stops.append(sensor.listen(partial(self._felt_here, name)))
         self._hear(topics.ESTIMATOR)
         self._watchman.start()
 
@@ -229,6 +229,13 @@ class ArmServer(DeviceServer):
     def _moved(self, reading: PoseReading) -> None:
         self.gates.at(reading.pose)
         self._guard()
+
+    def _felt_here(self, source: str, reading: WrenchReading) -> None:
+        """A sensor of this process: its stamps come to the bus's time as those of its stream do."""
+        if shift := self.desk.shift_ns():
+            stamp = replace(reading.stamp, capture_ns=reading.stamp.capture_ns + shift)
+            reading = replace(reading, stamp=stamp)
+        self._felt(source, reading)
 
     def _felt(self, source: str, reading: WrenchReading) -> None:
         reason = self.gates.feel(source, reading, self.desk.now_ns())

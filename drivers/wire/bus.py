@@ -20,7 +20,7 @@ from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.wire import topics
 from drivers.wire.security import Identity
 from drivers.wire.session import open_session
-from drivers.wire.streams import Publisher, Subscription
+from drivers.wire.streams import Publisher, Subscription, View
 from drivers.wire.watch import Watch, undeclare, wait_matching
 
 _VERDICT = 0.5  # an empty answer and the news of a death come together, in either order [s]
@@ -107,10 +107,15 @@ class Bus:
         _open.discard(self)
         self.session.close()  # an open session with a callback would keep the interpreter from ending
 
-    def publisher(self, topic: str, type_name: str, lossy: bool = False) -> Publisher:
-        """Announce a stream. ``lossy`` streams (images) drop rather than wait for a slow reader."""
+    def publisher(self, topic: str, type_name: str, view_rate: float | None = None) -> Publisher:
+        """Announce a stream, and with a ``view_rate`` [Hz] its view, the decimated topic for who looks on."""
+        view = None
+        if view_rate is not None:
+            seen = topics.view(topic)
+            withdraw = self.token(topics.discovery(self.zid, seen, type_name))
+            view = View(self.session, seen, type_name, view_rate, withdraw)
         withdraw = self.token(topics.discovery(self.zid, topic, type_name))
-        return Publisher(self.session, topic, type_name, lossy, withdraw)
+        return Publisher(self.session, topic, type_name, withdraw, view)
 
     def subscribe(self, topic: str) -> Subscription:
         """The stream of a topic; one subscription per topic, shared by all its listeners."""

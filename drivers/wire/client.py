@@ -41,9 +41,12 @@ class RemoteForceTorque(RemoteSensor[WrenchReading], ForceTorqueSensor):
 
 
 class RemoteTagCamera(RemoteSensor[TagReading], TagCamera):
-    """A tag camera on the bus."""
+    """A tag camera on the bus. It keeps as many frames as its server does."""
 
     kind = "tag_camera"
+
+    def __init__(self, name: str, link: Link, lockstep: bool, buffer: int = 256):
+        super().__init__(name, link, lockstep, buffer)
 
     def capture(self, timeout: float | None = None) -> TagReading:
         """As `ImagingSensor.capture`; None: as long as the bus waits for any reply."""
@@ -58,9 +61,12 @@ class RemoteTagCamera(RemoteSensor[TagReading], TagCamera):
 
 
 class RemoteTactile(RemoteSensor[ImageReading], TactileSensor):
-    """A tactile finger on the bus."""
+    """A tactile finger on the bus. It keeps fewer readings than others: a picture has up to half a megabyte."""
 
     kind = "tactile"
+
+    def __init__(self, name: str, link: Link, lockstep: bool, buffer: int = 64):
+        super().__init__(name, link, lockstep, buffer)
 
     def capture(self, timeout: float | None = None) -> ImageReading:
         """As `ImagingSensor.capture`; None: as long as the bus waits for any reply.
@@ -86,9 +92,12 @@ class RemoteTactile(RemoteSensor[ImageReading], TactileSensor):
 
 
 class RemoteGripper(RemoteSensor[GripperReading], Gripper):
-    """A gripper on the bus."""
+    """A gripper on the bus. It speaks seldom: what is kept of it is soon all that is ever kept."""
 
     kind = "gripper"
+
+    def __init__(self, name: str, link: Link, lockstep: bool, buffer: int = 512):
+        super().__init__(name, link, lockstep, buffer)
 
     def grasp(self, force: float) -> None:
         """As `Gripper.grasp`."""

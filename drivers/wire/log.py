@@ -26,7 +26,7 @@ from drivers.wire.streams import Sample
 ROOM = 256 * 2**20
 """Bytes that may wait to be written: half a minute of everything, half a gigabyte of a stuck disk's arrears never."""
 
-_CHUNK = 2**20
+_CHUNK = 4 * 2**20  # the index of every chunk stays in memory until the end: 700 bytes each
 _TICK = 0.02
 _LAST = 60.0  # how long closing may wait for the disk [s]
 _MARGIN = 0.8  # of the flush period; the rest is for writing

@@ -23,7 +23,7 @@ from mcap.records import Attachment, Channel, DataEnd, Footer, Header, McapRecor
 MAGIC = b"\x89MCAP0\r\n"
 
 ROOM = 2**26
-"""Bytes that a record or a chunk unpacked may have: 60 times what `drivers.wire.log` puts into one."""
+"""Bytes that a record or a chunk unpacked may have: 16 times what `drivers.wire.log` puts into one."""
 
 # of a record: opcode and length; of a message: channel, sequence, time of logging, time of publishing; of a chunk:
 # first and last time of logging, size and check sum unpacked, length of the compression's name

@@ -28,13 +28,15 @@ from drivers.wire import messages, topics
 from drivers.wire.bus import Bus, Query
 from drivers.wire.codec import Reading, encode_compressed, encode_reading
 from drivers.wire.lease import TIME_TO_LIVE
-from drivers.wire.streams import Outbox, Publisher
+from drivers.wire.streams import Outbox, Publisher, ViewRates
 from mechanics.readings import ImageReading, Stamp
 
 log = logging.getLogger(__name__)
 
 _RUINS = b"\xff\xff\xff\xff\xff\xff\xff"
 """Bytes that no type decodes: stands for a damaged message of the device, whose own bytes the bus does not carry."""
+
+_VIEWS = ViewRates()
 
 OUTCOMES: tuple[tuple[int, type[DriverError]], ...] = (
     (1, CommandRefused),
@@ -83,8 +85,8 @@ class Desk:
     """What the servers of one process share: the bus, the thread that owns the devices, the clock, the streams.
 
     ``run(work, urgent)`` has ``work`` executed by the owner of the devices. ``shift_ns()`` is added to every capture
-    time. In ``lockstep`` time stands still for who is slow, so a slow reader holds up even images. ``lease`` [s] is
-    how long a commander may be silent before it loses its arm.
+    time. In ``lockstep`` time stands still while nobody asks for more. ``lease`` [s] is how long a commander may be
+    silent before it loses its arm. ``views`` are the rates of what viewers get.
     """
 
     def __init__(
@@ -97,28 +99,25 @@ class Desk:
         shift_ns: Callable[[], int] = lambda: 0,
         lockstep: bool = False,
         lease: float = TIME_TO_LIVE,
+        views: ViewRates = _VIEWS,
     ):
         self.bus, self.station, self.now_ns, self.shift_ns = bus, station, now_ns, shift_ns
         self.run: Run = run or Lane()
-        self.lockstep, self.lease = lockstep, lease
+        self.lockstep, self.lease, self.views = lockstep, lease, views
         self.publishers: list[Publisher] = []
-        self._lossless: list[Publisher] = []
         self._outbox = Outbox()
 
     def publisher(self, device: str, stream: str, type_name: str) -> Publisher:
-        """Announce a stream. Images may be dropped on their way to a slow viewer, everything else arrives."""
-        lossy = not self.lockstep and type_name in (messages.IMAGE, messages.COMPRESSED_IMAGE)
-        publisher = self.bus.publisher(topics.key(self.station, device, stream), type_name, lossy)
+        """Announce a stream and its view. All of a stream arrives; viewers take the view, and hold up nobody."""
+        pictures = type_name in (messages.IMAGE, messages.COMPRESSED_IMAGE)
+        view_rate = self.views.images if pictures else self.views.readings
+        publisher = self.bus.publisher(topics.key(self.station, device, stream), type_name, view_rate)
         publisher.outbox = self._outbox
         for old in [known for known in self.publishers if known.topic == publisher.topic]:
             # a device that comes back goes on with its stream
             publisher.count, publisher.newest = old.count, old.newest
             self.publishers.remove(old)
-            if old in self._lossless:
-                self._lossless.remove(old)
         self.publishers.append(publisher)
-        if not lossy:
-            self._lossless.append(publisher)
         return publisher
 
     def serve(
@@ -128,7 +127,7 @@ class Desk:
 
         def handle(query: Query) -> None:
             def answer() -> None:
-                query.reply(self._reply(device, verb, lambda: work(query.payload), [] if direct else self._lossless))
+                query.reply(self._reply(device, verb, lambda: work(query.payload), [] if direct else self.publishers))
 
             if direct:
                 answer()

@@ -15,6 +15,7 @@ import zenoh
 from drivers.errors import NotConnected
 from drivers.wire.security import Identity
 
+_BATCHES, _VIEW_BATCHES = 16, 8  # of 64 KiB each, made when they are needed
 _LOOK = 1.0  # how long looking for the reason of a refusal may take [s]
 
 
@@ -70,6 +71,9 @@ def open_session(
         "connect/timeout_ms": int(timeout * 1000),
         "transport/unicast/open_timeout": int(2 * lease * 1000),
         "transport/link/tx/lease": int(lease * 1000),
+        # zenoh's own two batches do not hold the pictures of two fingers: their source waits, or a view goes without
+        "transport/link/tx/queue/size/data": _BATCHES,
+        "transport/link/tx/queue/size/data_low": _VIEW_BATCHES,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": int(lease * 1e6),
         **settings,
     }

@@ -1,4 +1,8 @@
-"""The two ends of a stream: what publishes it, what receives it, and what travels beside each message."""
+"""The two ends of a stream: what publishes it, what receives it, and what travels beside each message.
+
+Who needs a stream (the log, control) gets all of it, and its source waits for who is slow. Who looks on gets its view:
+the newest message now and then, or none at all where they are slow.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import zenoh
 
@@ -58,31 +63,95 @@ class Outbox:
             publisher.put(payload, attachment=beside)
 
 
-class Publisher:
-    """A stream on the bus. ``count`` messages were put on it, the newest with sequence number ``newest``.
+class ViewRates(NamedTuple):
+    """How often the views of a station's streams are sent at most [Hz of real time]."""
 
-    With an ``outbox`` that is open messages leave when that sends them.
+    readings: float = 20.0
+    images: float = 5.0
+
+
+class View:
+    """A stream's decimated sibling for viewers: the newest message, at most ``rate`` times a second of real time.
+
+    It has a low priority, and a viewer who cannot take a message goes without it: neither who publishes nor who takes
+    the whole stream waits for them. One thread asks and puts.
     """
 
-    def __init__(self, session: zenoh.Session, topic: str, type_name: str, lossy: bool, withdraw: Callable[[], None]):
-        self.topic, self.type_name = topic, type_name
-        self.count, self.newest = 0, -1
-        self.outbox = Outbox()
-        control = zenoh.CongestionControl.DROP if lossy else zenoh.CongestionControl.BLOCK
+    def __init__(self, session: zenoh.Session, topic: str, type_name: str, rate: float, withdraw: Callable[[], None]):
+        self.topic = topic
+        self.count = 0
+        self._period = 1.0 / rate
+        self._next = 0.0  # when it is time for a message, or to look for a viewer [s, monotonic]
+        self._wanted = False
         self._publisher = session.declare_publisher(
             topic,
             encoding=zenoh.Encoding.APPLICATION_CDR.with_schema(type_name),
-            congestion_control=control,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.DATA_LOW,
+        )
+        self._withdraw = withdraw
+
+    def wanted(self) -> bool:
+        """Whether the next message is for the view, too: it is time for one, and somebody looks on."""
+        now = time.monotonic()
+        if now >= self._next:
+            # looked up once in a period, for a stream may have a thousand messages a second
+            due = self._next + self._period
+            self._next = due if due > now else now + self._period
+            self._wanted = matching(self._publisher)
+        return self._wanted
+
+    def wait_matched(self, timeout: float, wanted: bool = True) -> bool:
+        """As `Publisher.wait_matched`, of those who look on."""
+        return wait_matching(self._publisher, time.monotonic() + timeout, wanted=wanted)
+
+    def put(self, payload: bytes, beside: bytes) -> None:
+        """Send the message that was `wanted`."""
+        self._wanted = False
+        self.count += 1
+        self._publisher.put(payload, attachment=beside)
+
+    def close(self) -> None:
+        """Withdraw the view; idempotent."""
+        self._withdraw()
+        undeclare(self._publisher)
+
+
+class Publisher:
+    """A stream on the bus. ``count`` messages were put on it, the newest with sequence number ``newest``.
+
+    With an ``outbox`` that is open messages leave when that sends them. What is put for the ``view`` alone, because
+    nobody takes the stream itself, is not counted.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        topic: str,
+        type_name: str,
+        withdraw: Callable[[], None],
+        view: View | None = None,
+    ):
+        self.topic, self.type_name, self.view = topic, type_name, view
+        self.count, self.newest = 0, -1
+        self.outbox = Outbox()
+        self._publisher = session.declare_publisher(
+            topic,
+            encoding=zenoh.Encoding.APPLICATION_CDR.with_schema(type_name),
+            congestion_control=zenoh.CongestionControl.BLOCK,
         )
         self._withdraw = withdraw
 
     @property
     def matched(self) -> bool:
-        """Whether anybody listens; a stream that nobody hears need not be encoded."""
+        """Whether anybody wants the next message; one that nobody hears need not be encoded."""
+        return self._heard() or (self.view is not None and self.view.wanted())
+
+    def _heard(self) -> bool:
         return self.outbox.matched(self) if self.outbox.open else self.heard()
 
     def heard(self) -> bool:
-        """Whether anybody listens at this moment."""
+        """Whether anybody takes the stream itself at this moment."""
         return matching(self._publisher)
 
     def wait_matched(self, timeout: float, wanted: bool = True) -> bool:
@@ -92,17 +161,23 @@ class Publisher:
     def put(self, payload: bytes, sequence: int, capture_ns: int, status: int = 0) -> None:
         """Publish one message."""
         beside = ATTACHMENT.pack(sequence, capture_ns, status)
+        self.newest = sequence
+        if self.view is not None and self.view.wanted():
+            self.view.put(payload, beside)
+            if not self._heard():
+                return
         if self.outbox.open:
             self.outbox.put(self._publisher, payload, beside)
         else:
             self._publisher.put(payload, attachment=beside)
         self.count += 1
-        self.newest = sequence
 
     def close(self) -> None:
         """Withdraw the stream; idempotent."""
         if self.outbox.open:
             self.outbox.send()
+        if self.view is not None:
+            self.view.close()
         self._withdraw()
         undeclare(self._publisher)
 

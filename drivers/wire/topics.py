@@ -1,6 +1,7 @@
-"""Key expressions: ``<station>/<device>/<stream or verb>``. Nothing outside `drivers` knows a key.
+"""Key expressions: ``<station>/<device>/<stream or verb>``, and ``<station>/<device>/<stream>/view`` for who looks on.
 
-A stream is a publication, a verb a query. The key of a stream is its ROS 2 topic name without the leading slash.
+Nothing outside `drivers` knows a key. A stream is a publication, a verb a query. The key of a stream is its ROS 2 topic
+name without the leading slash.
 """
 
 from __future__ import annotations
@@ -32,6 +33,14 @@ A tactile finger that measures depth sends it as it is, so that every ROS viewer
 def key(station: str, device: str, part: str) -> str:
     """The key of a device's stream or verb."""
     return f"{station}/{device}/{part}"
+
+
+def view(topic: str) -> str:
+    """The decimated sibling of a stream, for who looks on: the same type, the newest message now and then.
+
+    A log and control take the stream itself.
+    """
+    return f"{topic}/view"
 
 
 def alive(station: str, device: str) -> str:

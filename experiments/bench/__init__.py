@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from rich.console import Console
@@ -16,27 +17,47 @@ from experiments.progress import Progress
 from experiments.run_folder import write_json
 from mechanics.yaml_input import InputError, Problem, nearest, one_of
 
-Horizons = Sequence[int] | None
 #: columns of a table that goes to a file or a pipe
 FILE_WIDTH = 160
 
 
-def _sim(runs: int, _horizons: Horizons) -> Iterator[figures.Figure]:
+@dataclass(frozen=True)
+class Options:
+    """What a benchmark is asked for; None where it has a usual figure of its own, or no such option.
+
+    ``runs``: measurements per figure. ``horizons``: steps of the problems of `planning`. ``minutes`` and ``viewers``
+    are of `load`.
+    """
+
+    runs: int | None = None
+    horizons: Sequence[int] | None = None
+    minutes: float | None = None
+    viewers: int | None = None
+
+
+def _sim(options: Options) -> Iterator[figures.Figure]:
     from experiments.bench import sim
 
-    return sim.run(runs)
+    return sim.run(options.runs or RUNS)
 
 
-def _estimation(runs: int, _horizons: Horizons) -> Iterator[figures.Figure]:
+def _estimation(options: Options) -> Iterator[figures.Figure]:
     from experiments.bench import estimation
 
-    return estimation.run(runs)
+    return estimation.run(options.runs or RUNS)
 
 
-def _planning(runs: int, horizons: Horizons) -> Iterator[figures.Figure]:
+def _planning(options: Options) -> Iterator[figures.Figure]:
     from experiments.bench import planning
 
-    return planning.run(runs, horizons or planning.HORIZONS)
+    return planning.run(options.runs or RUNS, options.horizons or planning.HORIZONS)
+
+
+def _load(options: Options) -> Iterator[figures.Figure]:
+    from experiments.bench import load
+
+    viewers = load.VIEWERS if options.viewers is None else options.viewers
+    return load.run(options.minutes or load.MINUTES, viewers)
 
 
 def _side_by_side(measured: Sequence[figures.Figure]) -> Table:
@@ -45,33 +66,42 @@ def _side_by_side(measured: Sequence[figures.Figure]) -> Table:
     return planning_table.side_by_side(measured)
 
 
-BENCHMARKS: dict[str, Callable[[int, Horizons], Iterator[figures.Figure]]] = {
+BENCHMARKS: dict[str, Callable[[Options], Iterator[figures.Figure]]] = {
     "sim": _sim,
     "estimation": _estimation,
     "planning": _planning,
+    "load": _load,
 }
+#: which benchmarks have an option
+HAVE: dict[str, tuple[str, ...]] = {
+    "runs": ("sim", "estimation", "planning"),
+    "horizons": ("planning",),
+    "minutes": ("load",),
+    "viewers": ("load",),
+}
+#: measurements per figure
+RUNS = 5
 #: a second table of some benchmarks, made from the same figures
 TABLES: dict[str, Callable[[Sequence[figures.Figure]], Table]] = {"planning": _side_by_side}
 
 
-def main(
-    name: str, runs: int, json_file: Path | None, out: Path | None, check: bool, horizons: Horizons = None
-) -> ExitCode:
+def main(name: str, options: Options, json_file: Path | None, out: Path | None, check: bool) -> ExitCode:
     """Run a benchmark and show it; the exit code says whether every target holds, if that was asked.
 
-    ``horizons``: steps of the problems of `planning`. Raises InputError for a benchmark that does not exist, or one
-    that has no horizons.
+    Raises InputError for a benchmark that does not exist, or one that has no such option.
     """
     if name not in BENCHMARKS:
         known = one_of(BENCHMARKS)
         raise InputError([Problem("bench", None, name, "there is no such benchmark", known, nearest(name, BENCHMARKS))])
-    if horizons is not None and name != "planning":
-        raise InputError([Problem("bench", None, "--horizons", f"{name} has no horizons", "bench planning")])
+    for option, value in asdict(options).items():
+        if value is not None and name not in HAVE[option]:
+            having = " or ".join(f"bench {other}" for other in HAVE[option])
+            raise InputError([Problem("bench", None, f"--{option}", f"{name} has no {option}", having)])
     targets = figures.targets_of(name)
     said = Console(stderr=True)
     measured: list[figures.Figure] = []
     with Progress(said).step(f"bench {name}"):
-        for figure in BENCHMARKS[name](runs, horizons):
+        for figure in BENCHMARKS[name](options):
             measured.append(figure)
             said.print(f"{figure.name}: {figure.median:.3g} {figure.unit}", highlight=False, markup=False)
     console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else FILE_WIDTH)

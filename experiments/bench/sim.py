@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from drivers.config import StationConfig, TactileConfig, TagCameraConfig
+from drivers.config import DeviceConfig, StationConfig, TactileConfig, TagCameraConfig
 from drivers.interfaces import Arm, ArmTarget, ImagingSensor
 from drivers.scene import Scene
 from drivers.sim.plant import Plant
@@ -96,18 +96,23 @@ def _frames(resolved: Resolved, runs: int) -> Iterator[Figure]:
         "gel frame 320×240": TactileConfig(kind="tactile", sensor="gelslim", finger="left", width=320, height=240),
         "tag image, rendered and detected": camera,
     }
-    arm = {key: device for key, device in resolved.station.devices.items() if device.kind == "arm"}
     for name, config in wanted.items():
-        world = _pressed(resolved.station.model_copy(update={"devices": {**arm, "sensor": config}}), resolved)
-        sensor = world.devices["sensor"]
-        assert isinstance(sensor, ImagingSensor)
-        for _ in range(3):
-            sensor.capture(COMPILING)  # imports, compilation, the first solution
-        times = []
-        for _ in range(max(10, 4 * runs)):
-            world.advance(1 / 30)
-            times.append(1e3 * seconds(sensor.capture))
-        yield figure_of(name, times, "ms")
+        yield figure_of(name, frame_times(resolved, config, max(10, 4 * runs)), "ms")
+
+
+def frame_times(resolved: Resolved, config: DeviceConfig, frames: int) -> list[float]:
+    """What each of so many ``frames`` of an imaging sensor costs [ms], the go pressed on the ground and moving."""
+    arm = {key: device for key, device in resolved.station.devices.items() if device.kind == "arm"}
+    world = _pressed(resolved.station.model_copy(update={"devices": {**arm, "sensor": config}}), resolved)
+    sensor = world.devices["sensor"]
+    assert isinstance(sensor, ImagingSensor)
+    for _ in range(3):
+        sensor.capture(COMPILING)  # imports, compilation, the first solution
+    times = []
+    for _ in range(frames):
+        world.advance(1 / 30)
+        times.append(1e3 * seconds(sensor.capture))
+    return times
 
 
 def _everything(resolved: Resolved, runs: int) -> Figure:

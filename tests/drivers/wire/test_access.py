@@ -21,7 +21,7 @@ import zenoh
 from drivers.config import TlsConfig
 from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, NotConnected
 from drivers.interfaces import ArmTarget
-from drivers.wire import messages, topics
+from drivers.wire import messages, streams, topics
 from drivers.wire.arm_server import ArmServer
 from drivers.wire.bus import Bus
 from drivers.wire.client import RemoteArm, RemoteForceTorque
@@ -239,6 +239,27 @@ def test_another_station_on_the_same_router_is_nobodys(lab: Lab) -> None:
     bench.publisher("other/arm/pose", messages.POSE).put(b"x", 0, 0)
     assert alice.watch("lab/arm/alive").seen(5.0)
     assert got == []
+
+
+def test_a_viewer_looks_on_and_the_arm_hears_of_nobody_else(lab: Lab, bench: ArmServer, fake_arm: Any) -> None:
+    """Through the router, too, a view is made while somebody looks on, and only for those who may."""
+    publisher, view = bench._streams["pose"], topics.view("lab/arm/pose")
+    assert publisher.view is not None
+    refused = heard(lab.bus("runner-bob"), view)
+    wall = lab.bus("viewer-wall")
+    round_trip(wall)
+    assert not streams.matching(publisher.view._publisher)
+    got = heard(wall, view)
+    assert publisher.view.wait_matched(5.0)
+    forged = lab.bus("device-shelf").publisher(view, messages.POSE)
+    forged.put(b"forged", 1000, 0)
+    for i in range(1000):  # at the view's own rate, whenever it is time for the next
+        fake_arm.push(i)
+        if wall.subscribe(view).wait(0, None, time.monotonic() + 0.01):
+            break
+    assert got and all(sample.payload != b"forged" for sample in got)
+    assert publisher.count == 0, "nobody takes the stream itself"
+    assert refused == []
 
 
 # -- who may command --------------------------------------------------------------------------------------------------

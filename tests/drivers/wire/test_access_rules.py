@@ -62,3 +62,24 @@ def test_a_device_whose_name_is_a_pattern_gets_no_rights(device: str) -> None:
 def test_a_device_has_one_machine() -> None:
     with pytest.raises(ValueError):
         Access(station="lab", machines={"bench": ("arm",), "shelf": ("arm",)})
+
+
+def test_a_machine_publishes_the_views_of_its_devices_and_no_others_and_everybody_may_read_them() -> None:
+    view = topics.view("lab/arm/pose")
+    for name, message, flow, may in (
+        ("device-bench", "put", "ingress", True),
+        ("device-shelf", "put", "ingress", False),
+        ("viewer-wall", "put", "ingress", False),
+        ("runner-alice", "put", "ingress", False),
+        ("device-bench", "declare_subscriber", "egress", True),  # it learns that somebody looks on
+        *(
+            (member, "declare_subscriber", "ingress", True)
+            for member in ("viewer-wall", "runner-alice", "device-shelf")
+        ),
+        *((member, "put", "egress", True) for member in ("viewer-wall", "runner-alice", "device-shelf")),
+    ):
+        keys = [zenoh.KeyExpr(key) for f, m, key in granted(name) if (f, m) == (flow, message)]
+        assert any(key.includes(zenoh.KeyExpr(view)) for key in keys) is may, (name, message, flow)
+    token = zenoh.KeyExpr(topics.discovery("abc", view, "geometry_msgs/msg/PoseStamped"))
+    announced = [zenoh.KeyExpr(k) for f, m, k in granted("device-bench") if (f, m) == ("ingress", "liveliness_token")]
+    assert any(key.includes(token) for key in announced)

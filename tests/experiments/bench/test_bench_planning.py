@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from experiments.bench import main
+from experiments.bench import Options, main
 from experiments.bench.figures import Figure, targets_of
 from experiments.bench.planning_problem import described, pivoting_pentagon, regrasped
 from experiments.bench.planning_table import side_by_side
@@ -90,4 +90,4 @@ def test_targets_are_those_of_the_issue():
 
 def test_horizons_belong_to_the_benchmark_of_plans():
     with pytest.raises(InputError, match="sim has no horizons"):
-        main("sim", 1, None, None, False, horizons=(40,))
+        main("sim", Options(1, horizons=(40,)), None, None, False)
