@@ -6,10 +6,11 @@ status of its readings. Disagreement between witnesses of force is noticed where
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 from drivers.errors import DriverError
-from drivers.interfaces import Description, ImagingSensor
+from drivers.interfaces import Arm, Description, ImagingSensor
 from drivers.station import Devices
 from drivers.wire.remote import RemoteSensor
 from mechanics.readings import Status
@@ -68,6 +69,19 @@ class StationHealth:
             span = (heard[-1][0] - heard[0][0]) * NANO if len(heard) > 1 else 0.0
             found[device.name] = {"age_s": age, "rate_Hz": (len(heard) - 1) / span if span > 0 else None}
         return found
+
+    def reopen(self, name: str, timeout: float) -> bool:
+        """Open a sensor again whose server has died and may be back; whether it is worth another try.
+
+        An arm is not opened again: it was let go where it was, and a person looks before it moves.
+        """
+        for device, _ in self._streams:
+            if device.name == name and not isinstance(device, Arm):
+                device.close()
+                with suppress(DriverError):  # not yet
+                    device.connect(timeout)
+                return True
+        return False
 
     def ailments(self) -> list[Ailment]:
         """What is wrong now, by device; empty where all is well."""

@@ -59,7 +59,7 @@ class Suspender:
         """Let time pass until all is well or the limit is reached; how long it was [s], and what is still not well."""
         waited, found = 0.0, self._health.ailments()
         while found and waited < self._how.limit:
-            if any(ailment.kind == "gone" for ailment in found):  # it does not come back by itself
+            if not all(self._health.reopen(ailment.device, LOOK) for ailment in found if ailment.kind == "gone"):
                 break
             self._devices.clock.sleep(LOOK)
             waited += LOOK

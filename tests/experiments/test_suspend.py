@@ -6,6 +6,8 @@ import json
 
 import pytest
 
+from drivers.wire.log_reader import LogReader
+
 QUICK = ("--set", "stages.0.parameters.steps=3", "--set", "stages.1.controllers=[open_loop]")
 
 
@@ -36,6 +38,30 @@ def test_a_run_waits_at_a_checkpoint_and_goes_on(command):
     told = events(finished)
     assert any(text.startswith("paused, for 30 s at most: gripper: no reading for") for text in told)
     assert any(text.startswith("goes on after") for text in told)
+
+
+def test_a_sensor_whose_server_died_is_opened_again_once_that_is_back(command):
+    # in the first trial, which asks the gripper for nothing; as when the gripper's computer has been started anew
+    gone = faults({"kind": "disconnect", "device": "gripper", "after": 2.0, "duration": 20.0})
+    finished = command.run("grasped_static", *QUICK, *gone, "--set", "stages.1.trials=2")
+    assert finished.code == 0, finished.out + finished.err
+    assert [trial["status"] for trial in finished.results["trials"]] == ["completed"] * 2
+    told = events(finished)
+    assert any(text.startswith("paused, for 30 s at most: gripper: the device's server has died") for text in told)
+    assert any(text.startswith("goes on after") for text in told)
+    log = LogReader(finished.folder / "log.mcap")
+    captured = [message.publish_ns * 1e-9 for message in log.messages({"sim/gripper/state"})]
+    begin = min(message.publish_ns for message in log.messages()) * 1e-9
+    assert max(captured) - begin > 22.0, "what it says after that is in the log, too"
+
+
+@pytest.mark.parametrize("device", ["arm", "gripper"])
+def test_an_arm_that_vanished_is_not_waited_for_and_a_sensor_no_longer_than_the_limit(command, device):
+    gone = faults({"kind": "disconnect", "device": device, "after": 2.0})
+    sets = ("--set", "stages.1.trials=2", "--set", "health.limit=3")
+    finished = command.run("grasped_static", *QUICK, *gone, *sets)
+    assert finished.code == 3, finished.out + finished.err
+    assert device in finished.results["reason"]
 
 
 @pytest.mark.parametrize(("how", "code"), [("pause", 3), ("warn", 0)])
