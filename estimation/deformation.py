@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from estimation import strip_kernels as kernels
 from estimation.contact_memory import LEAST_AREA, ContactMemory, Touch
 from estimation.tactile_pose import FingerModel, PoseStatus
 from estimation.torn_depth import MOST_OUTWARD, torn
@@ -22,7 +23,6 @@ from mechanics.readings import Array, ImageReading, Stamp, Status
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-Indices = NDArray[np.integer]
 
 #: columns beyond which pictures are binned: the membrane has no detail that needs more
 MOST_COLUMNS = 320
@@ -34,6 +34,8 @@ LEAST_DEEP = 6e-3
 LEAST_PATCH = 2e-4
 #: −∇²z of a membrane where too little of it is known [1/m]
 USUAL_CURVATURE = 60.0
+#: scales of the rounds in which the face's plane is fitted [m]
+_NARROWER = np.array([2e-3, 1.5e-3, 1e-3, 0.7e-3, 0.7e-3, 0.5e-3, 0.5e-3])
 #: half of the stretch over which the membrane's curvature is taken [m]
 CURVED_OVER = 10e-3
 
@@ -103,11 +105,6 @@ class Deformation:
         back = np.linalg.inv(self.to_pixels)
         q = np.asarray(pixels, float) @ back[:, :2].T + back[:, 2]
         return q[..., :2] / q[..., 2:]
-
-    def rays(self, columns: Indices, rows: Indices) -> Array:
-        """How far (m, 2) in F's x and y the point that a pixel (m,) sees moves as its depth grows by one."""
-        across, down = self.untouched.across[columns], self.untouched.down[rows, 0]
-        return np.column_stack((across, down, np.ones(len(across)))) @ self.untouched.turn.T
 
     def curvature(self, p_F: Array) -> float:
         """−∇²z [1/m] of the untouched membrane at a point (2,) [m] of F: that of the paraboloid about it."""
@@ -331,17 +328,11 @@ def _plane(depth: Image, touched: Mask, across: Image, down: Image) -> Array:
     rows, columns = np.nonzero(touched)
     rows, columns = rows[::3], columns[::3]
     z = depth[rows, columns].astype(float)
-    A = np.column_stack((np.ones(len(z)), across[columns], down[rows, 0])).astype(float)
     counts, edges = np.histogram(z, bins=np.arange(z.min() - 5e-4, z.max() + 1e-3, 2.5e-4))
     counts = np.convolve(counts, np.ones(3), "same")
     best = int(counts.argmax())
     w = np.array([2.0 / (edges[best] + edges[best + 1]), 0.0, 0.0])
-    inverse, weight = 1.0 / z, z**4  # of inverse depth, an error of z weighs as 1/z²
-    for scale in (2e-3, 1.5e-3, 1e-3, 0.7e-3, 0.7e-3, 0.5e-3, 0.5e-3):
-        off = z - 1.0 / (A @ w)
-        trust = np.square(np.maximum(1.0 - (off / (3 * scale)) ** 2, 0.0)) * weight
-        AW = A * trust[:, None]
-        w = np.linalg.solve(AW.T @ A + 1e-12 * np.eye(3) * trust.sum(), AW.T @ inverse)
+    kernels.inverse_depth_plane(z, across[columns].astype(float), down[rows, 0].astype(float), _NARROWER, w)
     return w
 
 

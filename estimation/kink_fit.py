@@ -64,6 +64,7 @@ class KinkFit:
         self._own, self._base = np.zeros((self._n, 3)), np.zeros(self._n)
         #: which strips have an edge to show
         self.active = np.ones(count, bool)
+        self._constrained: np.ndarray | None = None
         self._seen, self._costs = np.zeros((count, 3)), np.zeros(count)
         self._edge_of = np.repeat(np.arange(self._n), strips)
         self._known = prior.information
@@ -132,19 +133,21 @@ class KinkFit:
         field = self._field
         size = 2 * round(8e-3 / field.pitch) + 1
         near = cv2.dilate(field.flat.astype(np.uint8), np.ones((size, size), np.uint8)).astype(bool) & field.valid
-        rows, columns = np.nonzero(near)
-        finger = self._finger
-        self._all = finger.in_ee(field.points(np.column_stack((columns, rows))))
-        self._all_rays = finger.in_ee(field.rays(columns, rows)) - finger.in_ee(np.zeros(2))
-        self._all_values = field.beyond[rows, columns].astype(float)
+        count, finger, bare = int(np.count_nonzero(near)), self._finger, field.untouched
+        origin = finger.in_ee(np.zeros(2))
+        to_ee = np.column_stack(((finger.in_ee(np.eye(2)) - origin).T, origin))
+        self._all, self._all_rays, self._all_values = np.empty((count, 2)), np.empty((count, 2)), np.empty(count)
+        kernels.pixels_about(
+            near, field.beyond, np.linalg.inv(field.to_pixels), to_ee, bare.across, bare.down, bare.turn,
+            self._all, self._all_rays, self._all_values
+        )  # fmt: skip
         self._assign()
 
     def _assign(self) -> None:
         edges = np.empty(len(self._all), np.int64)
         slack = 1e-3
         kernels.nearest_edges(self._all, self._lines, WITHIN + slack, OUTSIDE + slack, 0.5 * CORNER, edges)
-        on = edges >= 0
-        self._pixels = self._all[on], self._all_rays[on], self._all_values[on], edges[on]
+        self._pixels = self._all, self._all_rays, self._all_values, edges
 
     def _lines_at(self, pose: Array) -> Array:
         """The outline's edges (n, 5) at a pose, as `estimation.strip_kernels` has them."""
@@ -186,6 +189,9 @@ class KinkFit:
     def _constrain(self) -> None:
         """Which unknowns there are, and what is known of them beforehand: their information (m, m)."""
         first, active, edge_of = self._first, self.active, self._edge_of
+        if self._constrained is not None and np.array_equal(active, self._constrained):
+            return
+        self._constrained = active.copy()
         shown = np.bincount(edge_of[active], minlength=self._n) > 0
         used = np.flatnonzero(np.concatenate((np.ones(6, bool), np.repeat(shown, 3), active)))
         place = np.full(first + len(active), -1)

@@ -30,12 +30,18 @@ def ridge_scores(picture, to_pixels, points, normals, faces, poses, reach, least
             x, y = x0 + c * px - s * py, y0 + s * px + c * py
             nx = c * normals[i, 0] - s * normals[i, 1]
             ny = s * normals[i, 0] + c * normals[i, 1]
+            # the homography is linear in front of its division: a step along the normal adds the same each time
+            u0 = h[0, 0] * x + h[0, 1] * y + h[0, 2]
+            v0 = h[1, 0] * x + h[1, 1] * y + h[1, 2]
+            w0 = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+            du = reach * (h[0, 0] * nx + h[0, 1] * ny)
+            dv = reach * (h[1, 0] * nx + h[1, 1] * ny)
+            dw = reach * (h[2, 0] * nx + h[2, 1] * ny)
             second, inner = 0.0, 0.0
             for j in range(3):
-                qx, qy = x + (j - 1) * reach * nx, y + (j - 1) * reach * ny
-                w = h[2, 0] * qx + h[2, 1] * qy + h[2, 2]
-                u = (h[0, 0] * qx + h[0, 1] * qy + h[0, 2]) / w
-                v = (h[1, 0] * qx + h[1, 1] * qy + h[1, 2]) / w
+                past = j - 1.0
+                over = 1.0 / (w0 + past * dw)
+                u, v = (u0 + past * du) * over, (v0 + past * dv) * over
                 if not (u >= 0.0 and v >= 0.0 and u < columns - 1 and v < rows - 1):
                     inner = 1.0
                     break
@@ -56,6 +62,69 @@ def ridge_scores(picture, to_pixels, points, normals, faces, poses, reach, least
                     total += min(mean - least, cap)
             last, before = ridge, last
         out[k] = total
+
+
+@njit(cache=True, error_model="numpy")
+def pixels_about(near, beyond, to_points, to_ee, across, down, turn, points, rays, values):
+    """The pixels of ``near`` (h, w), row by row, into ``points``, ``rays`` (m, 2) [m] in ee and ``values`` (m,) [m].
+
+    ``to_points`` (3, 3) takes pixels to the face in F, ``to_ee`` (2, 3) that on to ee. A pixel's ray, of slopes
+    ``across`` (w,) and ``down`` (h, 1) and turned by ``turn`` (2, 3) into F, is how far its point moves in ee as its
+    depth grows by one; its value is its ``beyond`` (h, w).
+    """
+    b, M = to_points, to_ee
+    m = 0
+    for i in range(near.shape[0]):
+        for j in range(near.shape[1]):
+            if not near[i, j]:
+                continue
+            w = b[2, 0] * j + b[2, 1] * i + b[2, 2]
+            x = (b[0, 0] * j + b[0, 1] * i + b[0, 2]) / w
+            y = (b[1, 0] * j + b[1, 1] * i + b[1, 2]) / w
+            points[m, 0] = M[0, 0] * x + M[0, 1] * y + M[0, 2]
+            points[m, 1] = M[1, 0] * x + M[1, 1] * y + M[1, 2]
+            x = turn[0, 0] * across[j] + turn[0, 1] * down[i, 0] + turn[0, 2]
+            y = turn[1, 0] * across[j] + turn[1, 1] * down[i, 0] + turn[1, 2]
+            rays[m, 0] = M[0, 0] * x + M[0, 1] * y
+            rays[m, 1] = M[1, 0] * x + M[1, 1] * y
+            values[m] = beyond[i, j]
+            m += 1
+
+
+@njit(cache=True, error_model="numpy")
+def inverse_depth_plane(z, across, down, scales, w):
+    """Refine the weights ``w`` (3,) of inverse depth over (1, X/z, Y/z), in place: the plane of most of the points.
+
+    ``z`` (m,) are depths [m], ``across`` and ``down`` (m,) X/z and Y/z. A round for each of ``scales`` [m], by weights
+    that end at three of it off the plane. Of inverse depth, an error of z weighs as 1/z².
+    """
+    H, g = np.empty((3, 3)), np.empty((3, 1))
+    for scale in scales:
+        H[:] = 0.0
+        g[:] = 0.0
+        total = 0.0
+        for i in range(len(z)):
+            x, y = across[i], down[i]
+            off = (z[i] - 1.0 / (w[0] + w[1] * x + w[2] * y)) / (3.0 * scale)
+            rest = 1.0 - off * off
+            if rest <= 0.0:
+                continue
+            square = z[i] * z[i]
+            trust = rest * rest * square * square
+            total += trust
+            H[0, 0] += trust
+            H[1, 0] += trust * x
+            H[2, 0] += trust * y
+            H[1, 1] += trust * x * x
+            H[2, 1] += trust * x * y
+            H[2, 2] += trust * y * y
+            t = trust / z[i]
+            g[0, 0] += t
+            g[1, 0] += t * x
+            g[2, 0] += t * y
+        for k in range(3):
+            H[k, k] += 1e-12 * total
+        w[:] = solve_positive(H, g)[:, 0]
 
 
 @njit(cache=True, error_model="numpy")
@@ -114,7 +183,8 @@ def kink_equations(
     """Normal equations H (m, m), g (m,) of the kink's model, linearised at the present values.
 
     The model at a point (m, 2) is the ``plane`` (3,) plus, outside, s a − c a²/2, with a the distance from the edge, s
-    the slope of its strip and c the curvature of its edge. ``rays`` (m, 2) is how far a point moves as its depth grows.
+    the slope of its strip and c the curvature of its edge. ``edges`` (m,) are those of the points, −1: none. ``rays``
+    (m, 2) is how far a point moves as its depth grows.
     Unknowns: the pose's Δ (3), the plane (3), then (offset, tilt, c) = ``own`` (n, 3) for each edge, then s for each
     strip; ``place`` (u,) says where each stands in H and g, −1: not at all. ``starts`` (n + 1,) number each edge's
     strips, ``width`` [m] wide, from its first vertex. ``window`` (4,) [m]: how far inside and outside points count, how
@@ -134,6 +204,8 @@ def kink_equations(
     soft = window[3]
     for i in range(points.shape[0]):
         k = edges[i]
+        if k < 0:
+            continue
         x, y = points[i, 0], points[i, 1]
         tx, ty, length = lines[k, 2], lines[k, 3], lines[k, 4]
         along, a, inside = _from_edge(x, y, lines[k], own[k], window)
@@ -234,6 +306,8 @@ def departure_costs(
     costs[:] = 0.0
     for i in range(points.shape[0]):
         k = edges[i]
+        if k < 0:
+            continue
         x, y = points[i, 0], points[i, 1]
         tx, ty = lines[k, 2], lines[k, 3]
         along, a, inside = _from_edge(x, y, lines[k], own[k], window)

@@ -1,4 +1,4 @@
-"""The kink's normal equations, against the derivatives of its model by finite differences."""
+"""The compiled loops: the kink's equations against finite differences of its model, the others against plain numpy."""
 
 import numpy as np
 
@@ -89,3 +89,33 @@ def test_equations_of_some_unknowns_are_those_rows_of_all() -> None:
     some_H, some_g = equations(points, values, edge, z, place)
     np.testing.assert_array_equal(some_H, H[np.ix_(used, used)])
     np.testing.assert_array_equal(some_g, g[used])
+
+
+def test_the_pixels_about_a_face_lie_where_the_homography_and_the_finger_have_them():
+    rng = np.random.default_rng(2)
+    near, beyond = rng.random((7, 9)) < 0.4, rng.normal(size=(7, 9)).astype(np.float32)
+    back = np.array([[1e-3, 2e-5, 0.01], [-1e-5, 1.1e-3, -0.02], [1e-3, 2e-3, 1.0]])
+    to_ee = np.array([[0.0, -1.0, 0.03], [1.0, 0.0, -0.01]])
+    across, down = np.linspace(-0.5, 0.5, 9, dtype=np.float32), np.linspace(-0.4, 0.4, 7, dtype=np.float32)[:, None]
+    turn = rng.normal(size=(2, 3))
+    count = int(near.sum())
+    points, rays, values = np.empty((count, 2)), np.empty((count, 2)), np.empty(count)
+    kernels.pixels_about(near, beyond, back, to_ee, across, down, turn, points, rays, values)
+    rows, columns = np.nonzero(near)
+    on_face = np.column_stack((columns, rows, np.ones(count))) @ back.T
+    ones = np.ones((count, 1))
+    np.testing.assert_allclose(points, np.hstack((on_face[:, :2] / on_face[:, 2:], ones)) @ to_ee.T, atol=1e-14)
+    slopes = np.column_stack((across[columns], down[rows, 0], np.ones(count)))
+    np.testing.assert_allclose(rays, slopes @ turn.T @ to_ee[:, :2].T, atol=1e-14)
+    np.testing.assert_array_equal(values, beyond[rows, columns])
+
+
+def test_the_plane_of_most_of_the_points_is_found_though_a_third_lie_millimetres_off_it():
+    rng = np.random.default_rng(3)
+    across, down = rng.uniform(-0.4, 0.4, (2, 3000))
+    true = np.array([10.0, 0.6, -0.4])  # 0.1 m away and leaning
+    z = 1 / (true[0] + true[1] * across + true[2] * down)
+    z[::3] += rng.uniform(2e-3, 8e-3, 1000)
+    w = np.array([1 / 0.1003, 0.6 * 0.9, -0.4 * 0.9])
+    kernels.inverse_depth_plane(z, across, down, np.array([2e-3, 1e-3, 0.5e-3, 0.2e-3, 0.2e-3]), w)
+    np.testing.assert_allclose(w, true, atol=1e-6)
