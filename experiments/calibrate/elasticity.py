@@ -30,11 +30,15 @@ from mechanics.task_plane import TaskPlane
 LOOKS = 20
 #: how far a via point lies off, as a share of the amplitudes, and which holds are long ones
 VIA, LONG = 0.5, 20
+#: how many creep times the longest holds should last: in shorter ones slower creep is not told from stiffness
+HELD = 1.5
 #: the shortest displacement along an axis, as a share of its amplitude: a shorter one is mostly noise
 SHORTEST = 0.5
-#: what a tare leaves of the wrist sensor's drift while the samples are taken, 1 sigma [N, N, N·m], and the order of
-#: the polynomial in time that it may follow
-DRIFT, DRIFT_ORDER = (0.02, 0.02, 0.004), 8
+#: what a tare leaves of the wrist sensor's drift while the samples are taken, 1 sigma [N, N, N·m]
+DRIFT = (0.02, 0.02, 0.004)
+#: the polynomial in time that it may follow has one order for so many seconds, up to the most: one that bends faster
+#: would follow the creep instead, which would pass for stiffness
+DRIFT_TIME, MOST_ORDERS = 65.0, 8
 #: how well the arm repeats itself, 1 sigma of a hold [m, m, rad]: what the makers of such arms warrant. The fit begins
 #: with it; how well this arm does shows in the residuals
 POSE_NOISE = (1e-4, 1e-4, np.radians(0.1))
@@ -72,9 +76,13 @@ def elasticity_stage(context: RunContext, stage: ElasticityStage) -> None:
             times=samples.times,
             path=samples.path,
             holds=samples.holds,
-            drift_order=DRIFT_ORDER,
+            drift_order=drift_order(float(np.ptp(samples.times))),
             pose_noise_from_residuals=True,
         )
+    if stage.long_dwell < HELD * fit.memory.creep_time:
+        found = f"the fingers creep with a time of {fit.memory.creep_time:.2g} s"
+        lost = f"in holds of {stage.long_dwell:g} s slower creep passes for stiffness"
+        context.event("warning", f"{found}, and {lost}: lengthen `long_dwell`")
     amplitude = float(np.sqrt(np.mean(size(fit.stiffness, samples.x - fit.offset) ** 2)))
     found = ElasticityCalibration(
         origin=store.origin(resolved, devices, ("go",), context.folder.path.name),
@@ -100,6 +108,11 @@ def elasticity_stage(context: RunContext, stage: ElasticityStage) -> None:
     columns |= dict(zip(("fx_fit", "fy_fit", "tau_fit"), fit.wrench(seen).T, strict=True))
     save_samples(context, found.name, {"time": samples.times, **columns})
     context.calibrated(found)
+
+
+def drift_order(span: float) -> int:
+    """The order of the polynomial that the wrist sensor's drift may follow in ``span`` seconds."""
+    return int(np.clip(round(span / DRIFT_TIME), 1, MOST_ORDERS))
 
 
 def _rows(matrix: Array) -> Matrix3:
