@@ -61,7 +61,7 @@ class Targets(BaseModel):
     sim: dict[str, Target]
     estimation: dict[str, Target]
     planning: dict[str, Target]
-    load: dict[str, Target]
+    load: dict[str, Target] = {}
     tables: dict[str, dict[str, Target]] = {}
 
 

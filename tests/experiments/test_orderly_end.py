@@ -61,7 +61,8 @@ def test_a_terminal_that_is_closed_ends_the_run_in_order(tmp_path, command):
     own = "import fcntl, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); from experiments.cli import main; main()"
     child = [sys.executable, "-c", own, "run", "grasped_static", "--out", str(tmp_path / "run")]
     process = subprocess.Popen(
-        [*child, "--set", f"bus.endpoint={command.endpoint}"],
+        # so many trials that a crowded machine does not end them before it closes the terminal
+        [*child, "--set", f"bus.endpoint={command.endpoint}", "--set", "stages.1.trials=20"],
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
