@@ -12,7 +12,9 @@ from experiments import kernels
 
 @pytest.fixture(autouse=True)
 def nothing_said(monkeypatch, tmp_path):
-    monkeypatch.delenv(kernels.VARIABLE, raising=False)
+    # set first, so that what `keep` sets is taken back: the next test's run would compile everything anew
+    monkeypatch.setenv(kernels.VARIABLE, "")
+    monkeypatch.delenv(kernels.VARIABLE)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
 
 
