@@ -27,7 +27,7 @@ from ruamel.yaml.events import (
 Path = tuple[str | int, ...]
 
 MAX_DEPTH = 32  # a resolved run file is 8 deep
-MAX_NODES = 15_000  # counted after aliases are written out: a polygon of 4500 vertices fits, read in half a second
+MAX_NODES = 10_000  # counted after aliases are written out: a polygon of 3000 vertices fits, read in half a second
 
 _INT = re.compile(r"[-+]?[0-9]+")
 _BASED = re.compile(r"0o[0-7]+|0x[0-9a-fA-F]+")
