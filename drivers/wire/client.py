@@ -44,9 +44,7 @@ class RemoteTagCamera(RemoteSensor[TagReading], TagCamera):
     """A tag camera on the bus. It keeps as many frames as its server does."""
 
     kind = "tag_camera"
-
-    def __init__(self, name: str, link: Link, lockstep: bool, buffer: int = 256):
-        super().__init__(name, link, lockstep, buffer)
+    keeps = 256
 
     def capture(self, timeout: float | None = None) -> TagReading:
         """As `ImagingSensor.capture`; None: as long as the bus waits for any reply."""
@@ -64,9 +62,7 @@ class RemoteTactile(RemoteSensor[ImageReading], TactileSensor):
     """A tactile finger on the bus. It keeps fewer readings than others: a picture has up to half a megabyte."""
 
     kind = "tactile"
-
-    def __init__(self, name: str, link: Link, lockstep: bool, buffer: int = 64):
-        super().__init__(name, link, lockstep, buffer)
+    keeps = 64
 
     def capture(self, timeout: float | None = None) -> ImageReading:
         """As `ImagingSensor.capture`; None: as long as the bus waits for any reply.
@@ -95,9 +91,7 @@ class RemoteGripper(RemoteSensor[GripperReading], Gripper):
     """A gripper on the bus. It speaks seldom: what is kept of it is soon all that is ever kept."""
 
     kind = "gripper"
-
-    def __init__(self, name: str, link: Link, lockstep: bool, buffer: int = 512):
-        super().__init__(name, link, lockstep, buffer)
+    keeps = 512
 
     def grasp(self, force: float) -> None:
         """As `Gripper.grasp`."""
@@ -116,8 +110,8 @@ class RemoteArm(RemoteSensor[PoseReading], Arm):
     kind = "arm"
     _acquired = 0
 
-    def __init__(self, name: str, link: Link, lockstep: bool, buffer: int = 4096):
-        super().__init__(name, link, lockstep, buffer)
+    def __init__(self, name: str, link: Link, lockstep: bool):
+        super().__init__(name, link, lockstep)
         self._holder: str | None = None
         self._withdraw: Callable[[], None] = lambda: None
         self._targets = 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -18,21 +18,7 @@ from drivers.wire.remote import RemoteSensor
 from drivers.wire.watch import Watch
 from mechanics.readings import Array, TruthReading
 
-Slept = Callable[[float, float, float], None]
-"""Told of a sleep in real time: when it began [s, monotonic], how long it was to take and how long it took [s]."""
-
-_slept: Slept | None = None
-
 _PIECE_NS = 250_000_000  # station time per request: a long sleep stays interruptible, and each reply comes in time
-
-
-def tell_sleeps(told: Slept | None) -> None:
-    """Have ``told`` hear of every sleep of this process's real-time stations, in the thread that slept; None: nobody.
-
-    What lies between two sleeps is the work of a control loop, and what a sleep took too long its lateness.
-    """
-    global _slept  # noqa: PLW0603
-    _slept = told
 
 
 class RemoteClock:
@@ -51,11 +37,8 @@ class RemoteClock:
         if not 0.0 <= seconds < 1e6:
             raise ValueError(f"a sleep of {seconds} s; expected a finite time that is not negative")
         if not self.lockstep:
-            begin = time.monotonic()
             if self._watch.wait(seconds):
                 raise DeviceFault(topics.WORLD, "sleep", "the station has died", "Start the station again")
-            if _slept is not None:
-                _slept(begin, seconds, time.monotonic() - begin)
             return
         left = round(seconds * 1e9)
         while left > 0:

@@ -27,12 +27,14 @@ class RemoteSensor(Sensor[R]):
     """The half that all remote devices share: the stream, the description, and the news of the server's death."""
 
     kind: ClassVar[str]
+    #: how many readings are kept
+    keeps: ClassVar[int] = 4096
 
-    def __init__(self, name: str, link: Link, lockstep: bool, buffer: int = 4096):
-        super().__init__(name, buffer)
+    def __init__(self, name: str, link: Link, lockstep: bool):
+        super().__init__(name, self.keeps)
         self._link, self._lockstep = link, lockstep
         self._stream, self._type = next(iter(topics.STREAMS[self.kind].items()))
-        self._kept: deque[Sample] = deque(maxlen=buffer)
+        self._kept: deque[Sample] = deque(maxlen=self.keeps)
         self._decoded: dict[int, R] = {}
         self._watch: Watch | None = None
         self._subscription: Subscription | None = None

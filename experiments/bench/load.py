@@ -47,8 +47,8 @@ LIMITS = {
 WARM_UP, BLOCK = 0.1, 0.05
 #: how long a phase with or without viewers is at least where there is time, and how long viewers come and go [s]
 PHASE, SETTLE = 30.0, 2.0
-#: between two looks at the memory [s]
-LOOK = 2.0
+#: between two looks at the memory, and at the results of a run that is about to end [s]
+LOOK, LAST_LOOK = 2.0, 0.2
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK") if hasattr(os, "sysconf") else 100
 
 
@@ -82,13 +82,13 @@ def run(minutes: float = MINUTES, viewers: int = VIEWERS, sets: Sequence[str] = 
         stack.enter_context(runner)
         order = {"experiment": EXPERIMENT, "sets": chosen, "out": str(out), "sleeps": str(sleeps)}
         runner.tell(json.dumps(order))
-        pids = {"host": runner.heard("host"), "runner": runner.pid}
-        _await_loop(runner, sleeps, out)
+        pids = {"host": _heard(runner, "host", runner, out), "runner": runner.pid}
+        _heard(runner, "loop", runner, out)
         lookers: list[Child] = []
         for i in range(viewers):  # one after the other: to come up together would be a load of another kind
             looker = stack.enter_context(Child("experiments.bench.load_viewer", f"viewer {i + 1}", folder))
             looker.tell(resolved.station.model_dump_json())
-            _await_ready(looker, runner, out)
+            _heard(looker, "ready", runner, out)
             lookers.append(looker)
         pids |= {looker.name: looker.pid for looker in lookers}
         seen = _Watching(runner, lookers, pids)
@@ -117,19 +117,10 @@ def rendering(resolved: Resolved) -> Iterator[Figure]:
     yield figure_of("rendering", [100 * sum(shares)], "% of a core", "all pictures at their rates")
 
 
-def _await_loop(runner: Child, sleeps: Path, out: Path) -> None:
-    """Wait until the control loop runs: some of its sleeps have reached the file. Raises NotConnected."""
-    deadline = time.monotonic() + PATIENCE
-    while not (sleeps.exists() and sleeps.stat().st_size):
-        if not runner.running or time.monotonic() > deadline:
-            raise NotConnected("runner", "run its control loop", _reason(runner, out), "`extrinsic run` tells more")
-        time.sleep(0.1)
-
-
-def _await_ready(viewer: Child, runner: Child, out: Path) -> None:
-    """Wait until a viewer is on the bus. Raises NotConnected, with the run's own reason where that has ended."""
+def _heard(child: Child, key: str, runner: Child, out: Path) -> Any:
+    """What a ``child`` says under ``key``. Raises NotConnected, with the run's own reason where that has ended."""
     try:
-        viewer.heard("ready")
+        return child.heard(key)
     except NotConnected as error:
         if runner.running and _results(out)["status"] == "running":
             raise
@@ -179,10 +170,8 @@ class _Watching:
         self._cpu = {name: (cpu[name], after) for name, after in self._processor().items() if name in cpu}
 
     def _look(self, due: float, until: float) -> float:
-        """Sleep until the next look at the memory is ``due``, or ``until``; returns when the one after that is."""
-        now = time.monotonic()
-        time.sleep(max(min(due, until) - now, 0.0))
-        if time.monotonic() < due:
+        """Wait until the next look at the memory is ``due``, ``until``, or the runner's end; when the next look is."""
+        if self._runner.wait(max(min(due, until) - time.monotonic(), 0.0)) or time.monotonic() < due:
             return due
         for name, pid in self._pids.items():
             size = own_memory(pid)
@@ -227,11 +216,11 @@ def _ended(runner: Child, out: Path) -> dict[str, Any]:
     """End the run in order and return its results; the report, of a log of gigabytes, is not waited for."""
     runner.ask_to_end()
     deadline = time.monotonic() + PATIENCE
-    while runner.running and time.monotonic() < deadline:
+    # its results are a file, which is looked at anew until the process has ended
+    while not runner.wait(LAST_LOOK) and time.monotonic() < deadline:
         if (results := _results(out)).get("status") != "running":
             runner.kill()
             return results
-        time.sleep(0.2)
     return _results(out)
 
 

@@ -66,6 +66,14 @@ class Child:
         """Whether it has not ended."""
         return self._process.poll() is None
 
+    def wait(self, timeout: float) -> bool:
+        """Wait until it has ended, so many seconds at most; whether it has."""
+        try:
+            self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
     def tell(self, line: str) -> None:
         """Send it a line; one that has ended hears nothing."""
         assert self._process.stdin is not None

@@ -1,7 +1,8 @@
 """The process under load: an experiment as `extrinsic run` runs it, whose control loop's sleeps are noted.
 
 It reads one line of JSON from standard input (``{"experiment", "sets", "out", "sleeps"}``) and says on standard output
-when its host runs (``{"host": pid}``). When standard input ends, the run is interrupted and ends in order.
+when its host runs (``{"host": pid}``) and when its control loop does (``{"loop": true}``). When standard input ends,
+the run is interrupted and ends in order.
 """
 
 from __future__ import annotations
@@ -12,13 +13,16 @@ import signal
 import struct
 import sys
 import threading
+import time
+from collections.abc import Callable
+from math import isclose
 from pathlib import Path
 from typing import Self
 
 from rich.console import Console
 
 from drivers.hosting import HostProcess
-from drivers.wire.clock import tell_sleeps
+from drivers.wire.clock import RemoteClock
 from experiments import runner
 from experiments.files import load
 
@@ -29,9 +33,28 @@ SLEEP = struct.Struct("<ddd")
 class _Told(HostProcess):
     def __enter__(self) -> Self:
         super().__enter__()
-        sys.stdout.write(json.dumps({"host": self.pid}) + "\n")
-        sys.stdout.flush()
+        _say(host=self.pid)
         return self
+
+
+def _say(**said: object) -> None:
+    sys.stdout.write(json.dumps(said) + "\n")
+    sys.stdout.flush()
+
+
+def time_sleeps(told: Callable[[float, float, float], None]) -> None:
+    """Have every sleep of this process's clocks told: its begin [s, monotonic], what was asked for, what it took [s].
+
+    What lies between two sleeps is the work of a control loop, and what a sleep took too long its lateness.
+    """
+    sleep = RemoteClock.sleep
+
+    def timed(self: RemoteClock, seconds: float) -> None:
+        begin = time.monotonic()
+        sleep(self, seconds)
+        told(begin, seconds, time.monotonic() - begin)
+
+    RemoteClock.sleep = timed
 
 
 def _interrupt_with_input() -> None:
@@ -46,12 +69,17 @@ def main() -> int:
     threading.Thread(target=_interrupt_with_input, name="order", daemon=True).start()
     # into a file, not a list: the process's own memory is among what is measured
     with Path(order["sleeps"]).open("wb") as file:
+        resolved, looping = load(order["experiment"], None, order["sets"]), False
+        period = 1.0 / resolved.experiment.trial.control_rate
 
         def note(begin: float, asked: float, took: float) -> None:
+            nonlocal looping
             file.write(SLEEP.pack(begin, asked, took))
+            if not looping and isclose(asked, period, rel_tol=1e-6):
+                looping = True
+                _say(loop=True)
 
-        tell_sleeps(note)
-        resolved = load(order["experiment"], None, order["sets"])
+        time_sleeps(note)
         return int(runner.run(resolved, Path(order["out"]), Console(stderr=True), _Told).exit_code)
 
 

@@ -79,10 +79,8 @@ def elasticity_stage(context: RunContext, stage: ElasticityStage) -> None:
             drift_order=drift_order(float(np.ptp(samples.times))),
             pose_noise_from_residuals=True,
         )
-    if stage.long_dwell < HELD * fit.memory.creep_time:
-        found = f"the fingers creep with a time of {fit.memory.creep_time:.2g} s"
-        lost = f"in holds of {stage.long_dwell:g} s slower creep passes for stiffness"
-        context.event("warning", f"{found}, and {lost}: lengthen `long_dwell`")
+    if warning := too_short(stage.long_dwell, fit.memory.creep_time):
+        context.event("warning", warning)
     amplitude = float(np.sqrt(np.mean(size(fit.stiffness, samples.x - fit.offset) ** 2)))
     found = ElasticityCalibration(
         origin=store.origin(resolved, devices, ("go",), context.folder.path.name),
@@ -108,6 +106,14 @@ def elasticity_stage(context: RunContext, stage: ElasticityStage) -> None:
     columns |= dict(zip(("fx_fit", "fy_fit", "tau_fit"), fit.wrench(seen).T, strict=True))
     save_samples(context, found.name, {"time": samples.times, **columns})
     context.calibrated(found)
+
+
+def too_short(long_dwell: float, creep_time: float) -> str:
+    """What to say where the longest holds [s] are too short for the creep that was found [s], or nothing."""
+    if long_dwell >= HELD * creep_time:
+        return ""
+    found = f"the fingers creep with a time of {creep_time:.2g} s"
+    return f"{found}, and in holds of {long_dwell:g} s slower creep passes for stiffness: lengthen `long_dwell`"
 
 
 def drift_order(span: float) -> int:

@@ -17,29 +17,14 @@ from drivers.sim.world import World
 from drivers.wire import messages, topics
 from drivers.wire.bus import Bus
 from experiments.ports import free_endpoint
-
-NS = 1_000_000_000
-
-
-class Time:
-    """A clock that a test turns by hand."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def time_ns(self) -> int:
-        return 1_700_000_000 * NS + round(self.now * NS)
+from tests.drivers.by_hand import Time
 
 
 @pytest.fixture
 def by_hand(monkeypatch: pytest.MonkeyPatch) -> Time:
     clock = Time()
-    patched = SimpleNamespace(monotonic=clock.monotonic, time_ns=clock.time_ns)
-    monkeypatch.setattr(hosts, "time", patched)
-    monkeypatch.setattr(worlds, "time", patched)
+    monkeypatch.setattr(hosts, "time", clock)
+    monkeypatch.setattr(worlds, "time", clock)
     return clock
 
 

@@ -8,8 +8,9 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from drivers.wire.link import Link
 from drivers.wire.server import Desk, DeviceServer
 from drivers.wire.streams import Publisher, Sample, Subscription, ViewRates
 from mechanics.readings import ImageReading, PoseReading, Stamp
+from tests.drivers.by_hand import Time
 
 from .conftest import FakeArm, FakeForceTorque
 
@@ -33,23 +35,10 @@ ROOT = Path(__file__).parents[3]
 PICTURE = bytes(224 * 171 * 2)
 
 
-class Time:
-    """A clock that a test turns by hand; time of the day goes on."""
-
-    def __init__(self) -> None:
-        self.now = 1000.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-    def time_ns(self) -> int:
-        return time.time_ns()
-
-
 @pytest.fixture
 def by_hand(monkeypatch: pytest.MonkeyPatch) -> Time:
     clock = Time()
-    monkeypatch.setattr(streams, "time", SimpleNamespace(monotonic=clock.monotonic, time_ns=clock.time_ns))
+    monkeypatch.setattr(streams, "time", clock)
     return clock
 
 
@@ -205,71 +194,73 @@ with Bus(sys.argv[1], shared_memory=False) as bus:
 """
 
 
+@contextmanager
+def standing_still(endpoint: str, topic: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that takes nothing in until it is sent a line."""
+    command = [sys.executable, "-c", STANDING_STILL, endpoint, topic]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def go_on(process: subprocess.Popen[bytes]) -> None:
+    assert process.stdin is not None
+    process.stdin.write(b"\n")
+    process.stdin.flush()
+
+
+def said(process: subprocess.Popen[bytes], timeout: float) -> int | None:
+    """How many messages it has had, once it has had the newest; None where it does not say so in time."""
+    assert process.stdout is not None
+    return int(process.stdout.readline() or -1) if select.select([process.stdout], [], [], timeout)[0] else None
+
+
 def test_a_viewer_that_stands_still_holds_nobody_up(served: Bus, joined: Bus, by_hand: Time) -> None:
     """Far more than queues and sockets hold is put for it; it goes without, and is still a viewer afterwards."""
     publisher = served.publisher("lab/finger/image", messages.IMAGE, 20.0)
     subscription = joined.subscribe("lab/finger/image")
     subscription.listen(lambda _: None)
     assert streams.wait_matching(publisher._publisher, soon())
-    count = 1500
-    command = [sys.executable, "-c", STANDING_STILL, served.endpoint, "lab/finger/image/view"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT) as viewer:
-        try:
-            assert viewer.stdin is not None and viewer.stdout is not None and publisher.view is not None
-            assert streams.wait_matching(publisher.view._publisher, time.monotonic() + 20.0)
-            for i in range(count):
-                by_hand.now += 1.0
-                offer(publisher, i, PICTURE)
-            assert arrived(subscription, count - 1)
-            assert subscription.count == publisher.view.count == count
-            viewer.stdin.write(b"\n")
-            viewer.stdin.flush()
-            for i in range(count, count + 1000):  # until its queue has room again
-                by_hand.now += 1.0
-                offer(publisher, i, b"newest")
-                if select.select([viewer.stdout], [], [], 0.02)[0]:
-                    break
-            said = viewer.stdout.readline()
-            assert said, "it was cut off"
-            assert int(said) < count, "it went without what it could not take"
-        finally:
-            viewer.kill()
-
-
-FALTERING = """
-import sys, time
-import zenoh
-from drivers.wire.bus import Bus
-
-seen = [0]
-
-def falter(sample):
-    if not seen[0]:
-        time.sleep(0.4)  # nothing is read from its socket meanwhile
-    seen[0] += 1
-    if sample.payload.to_bytes() == b"last":
-        print(seen[0], flush=True)
-
-with Bus(sys.argv[1], shared_memory=False) as bus:
-    bus.session.declare_subscriber(sys.argv[2], zenoh.handlers.Callback(falter, indirect=False))
-    sys.stdin.readline()
-"""
+    count, had = 1500, None
+    with standing_still(served.endpoint, "lab/finger/image/view") as viewer:
+        assert publisher.view is not None
+        assert streams.wait_matching(publisher.view._publisher, time.monotonic() + 20.0)
+        for i in range(count):
+            by_hand.now += 1.0
+            offer(publisher, i, PICTURE)
+        assert arrived(subscription, count - 1)
+        assert subscription.count == publisher.view.count == count
+        go_on(viewer)
+        for i in range(count, count + 1000):  # until its queue has room again
+            by_hand.now += 1.0
+            offer(publisher, i, b"newest")
+            if (had := said(viewer, 0.02)) is not None:
+                break
+    assert had is not None and had > 0, "it was cut off"
+    assert had < count, "it went without what it could not take"
 
 
 def test_who_takes_the_stream_itself_misses_no_picture_for_faltering(served: Bus) -> None:
-    """More than queues and sockets hold is put while the reader is away for less than the lease: its source waits."""
+    """More than queues and sockets hold is put while the reader is away, for less than the lease: its source waits."""
     publisher = served.publisher("lab/finger/image", messages.IMAGE, 5.0)
-    command = [sys.executable, "-c", FALTERING, served.endpoint, "lab/finger/image"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT) as reader:
-        try:
-            assert reader.stdout is not None and publisher.wait_matched(20.0)
-            for i in range(300):
-                publisher.put(PICTURE, i, i)
-            publisher.put(b"last", 300, 300)
-            assert select.select([reader.stdout], [], [], 20.0)[0], "it was cut off, or the last one is lost"
-            assert int(reader.stdout.readline()) == 301
-        finally:
-            reader.kill()
+
+    def put() -> None:
+        for i in range(300):
+            publisher.put(PICTURE, i, i)
+        publisher.put(b"newest", 300, 300)
+
+    source = threading.Thread(target=put, name="source")
+    with standing_still(served.endpoint, "lab/finger/image") as reader:
+        assert publisher.wait_matched(20.0)
+        source.start()
+        source.join(0.3)
+        waited = source.is_alive()
+        go_on(reader)
+        source.join(20.0)
+        assert waited, "it is to wait for its reader"
+        assert said(reader, 20.0) == 301
 
 
 # -- devices ----------------------------------------------------------------------------------------------------------

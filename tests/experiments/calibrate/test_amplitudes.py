@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.calibrate.elasticity import amplitudes, drift_order, schedule
+from experiments.calibrate.elasticity import amplitudes, drift_order, schedule, too_short
 from experiments.calibrate.schema import ElasticityStage
 from mechanics.catalogue import load_sensor
 
@@ -56,3 +56,8 @@ def test_a_third_of_the_holds_lie_along_one_axis_and_none_is_short():
 def test_a_drift_may_bend_no_faster_in_a_short_session_than_in_a_long_one():
     # eight orders in the nine minutes of 200 samples; in two minutes as many would follow the fingers' creep of 8 s
     assert [drift_order(span) for span in (20.0, 107.0, 533.0, 5000.0)] == [1, 2, 8, 8]
+
+
+def test_holds_too_short_for_the_creep_are_told():
+    assert too_short(15.0, 8.0) == too_short(0.4, 0.0) == ""
+    assert "in holds of 3 s slower creep passes for stiffness" in too_short(3.0, 2.8)
