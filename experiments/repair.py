@@ -26,7 +26,7 @@ from experiments.metrics import contact_of, errors_of
 from experiments.planning.files import FOLDER as PLANS
 from experiments.report.build import build_report
 from experiments.report.collect import LoggedTrial, Logs, plan_of, read_logs
-from experiments.results_file import ShownResults, read_json
+from experiments.results_file import BEGUN, Begun, ShownResults, parse_json, read_json
 from experiments.run_folder import RunFolder, write_atomic, write_json
 from experiments.run_lock import RunLock
 from experiments.runner import begun
@@ -154,20 +154,25 @@ def _results(folder: RunFolder) -> dict[str, Any] | None:
 def _begun(folder: RunFolder, resolved: Resolved) -> dict[str, Any]:
     """The results of a run of which no results.json is left, without its trials."""
     unknown = {"execute_wall_s": None, "execute_station_s": None}
-    own = {"started": _started(folder), "provenance": None, "plans": _plans(folder), "timing": unknown}
-    return begun(resolved, _calibrations(folder)) | own
+    known = {"plans": _plans(folder), "timing": unknown}
+    return begun(resolved, _calibrations(folder)) | _known_at_its_begin(folder) | known
 
 
-def _started(folder: RunFolder) -> str | None:
-    """When the first log was begun: its attachments bear wall time."""
+def _known_at_its_begin(folder: RunFolder) -> dict[str, Any]:
+    """What the first log that can be read carries of it; of one that carries nothing, when it was begun."""
     for log in folder.logs():
+        begun_at = None
         try:
             for record in LogReader(log).records():
                 if isinstance(record, Attachment):
-                    return _instant(record.create_time * 1e-9)
+                    if record.name == BEGUN and (found := parse_json(record.data, Begun)) is not None:
+                        return {key: found[key] for key in Begun.model_fields}
+                    begun_at = begun_at or _instant(record.create_time * 1e-9)
         except ProtocolError:
             continue
-    return None
+        if begun_at is not None:
+            return {"started": begun_at, "provenance": None}
+    return {"started": None, "provenance": None}
 
 
 def _instant(seconds: float) -> str | None:

@@ -11,6 +11,9 @@ from pydantic import BaseModel, Field
 #: a trial's figures are 6 deep in results.json
 _DEPTH = 32
 
+#: what a log calls the attachment that says what was known when its run began
+BEGUN = "run.json"
+
 Word = Annotated[str, Field(max_length=1000)]
 
 
@@ -75,13 +78,28 @@ class ShownResults(_Ended):
     trials: list[NamedTrial]
 
 
+class Begun(BaseModel):
+    """What is known of a run when it begins; its log carries it, so that it outlives results.json."""
+
+    started: Word
+    provenance: dict[Word, Any]
+
+
 def read_json(file: Path, model: type[BaseModel]) -> dict[str, Any] | None:
     """The JSON in ``file``, which says at least what ``model`` asks for; None where it does not, or is not there."""
     try:
-        found = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse)
+        return parse_json(file.read_bytes(), model)
+    except FileNotFoundError:
+        return None
+
+
+def parse_json(data: bytes, model: type[BaseModel]) -> dict[str, Any] | None:
+    """The JSON in ``data``, which says at least what ``model`` asks for; None where it does not."""
+    try:
+        found = json.loads(data.decode("utf-8"), parse_constant=_refuse)
         model.model_validate(found, strict=True)
         return found if _depth(found) <= _DEPTH else None
-    except (FileNotFoundError, ValueError, RecursionError):  # pydantic's error is a ValueError
+    except (ValueError, RecursionError):  # pydantic's error is a ValueError
         return None
 
 

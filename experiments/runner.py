@@ -7,6 +7,7 @@ goes on from there.
 from __future__ import annotations
 
 import gc
+import json
 import sys
 import traceback
 from collections.abc import Callable, Mapping
@@ -37,6 +38,7 @@ from experiments.planning.stage import take_plan_again
 from experiments.progress import Progress, outlive_terminal
 from experiments.provenance import provenance
 from experiments.report.build import build_report
+from experiments.results_file import BEGUN, Begun
 from experiments.run_folder import RunFolder, write_atomic, write_json
 from experiments.run_lock import RunLock
 from experiments.stages import STAGES, has_diverged, skip_stages
@@ -146,6 +148,8 @@ def _stages(
     try:
         log = closing.enter_context(LogWriter(folder.next_log(), flush=resolved.station.log.flush))
         log.add_attachment("experiment.yaml", "application/yaml", folder.experiment.read_bytes())
+        begin = {key: results[key] for key in Begun.model_fields}
+        log.add_attachment(BEGUN, "application/json", json.dumps(begin).encode())
         progress, ask, heed = Progress(console), _ask(console), interrupt.check
         context = RunContext(resolved, calibrations, folder, results, log, progress, closing, ask, heed, host)
         code, reason = _carried_out(context, interrupt)

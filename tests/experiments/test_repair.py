@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 from contextlib import suppress
+from datetime import datetime, timedelta
 
 import pytest
 from mcap.reader import SeekingReader
@@ -82,12 +83,24 @@ def test_the_rows_made_from_the_log_are_those_that_the_run_wrote(run, finished):
     rebuilt, original = json.loads(run.results.read_text()), finished.results
     known = [without(row, OWN) for row in original["trials"]]
     assert [without(row, OWN) for row in rebuilt["trials"]] == known
-    for key in ("schema", "experiment", "station", "profile", "seed", "started"):
+    for key in ("schema", "experiment", "station", "profile", "seed", "started", "provenance"):
         assert rebuilt[key] == original[key], key
     how = {"optimiser", "backend", "form", "believed", "time_s"}
     assert [without(row, how) for row in rebuilt["plans"]] == [without(row, how) for row in original["plans"]]
     assert rebuilt["status"] == "interrupted"
     assert "cut off" in rebuilt["reason"]
+
+
+def test_a_log_of_before_tells_when_its_run_began_to_the_second(run, finished, monkeypatch):
+    monkeypatch.setattr("experiments.repair.BEGUN", "no log carries this")
+    run.results.unlink()
+    repair(run.path)
+    rebuilt = json.loads(run.results.read_text())
+    began, told = (datetime.fromisoformat(results["started"]) for results in (finished.results, rebuilt))
+    assert (
+        timedelta(0) <= told - began < timedelta(seconds=60)
+    )  # the log was begun after the run, and before its trials
+    assert rebuilt["provenance"] is None
 
 
 def test_a_torn_log_is_mended_and_the_report_reads_it(run, finished):
