@@ -7,7 +7,7 @@ GUIDED ?= 600
 export OMP_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup browser demo test test-slow fuzz check format clean
+.PHONY: help setup browser usb demo test test-slow fuzz check format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -33,13 +33,25 @@ browser:
 	  fi; \
 	fi
 
+usb:
+	@if ! $(BIN)/python -c 'import pyrealsense2' 2>/dev/null && $(BIN)/python -m pip show -q pyrealsense2 2>/dev/null; then \
+	  if command -v apt-get >/dev/null 2>&1 && [ "$$(id -u)" = 0 ]; then \
+	    echo "installing libusb (the tests of the RealSense cameras need it) ..."; \
+	    (apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -yq --no-install-recommends libusb-1.0-0) >/dev/null 2>&1 \
+	      || echo "could not install libusb; the tests of the RealSense cameras will be skipped"; \
+	  else \
+	    echo "the tests of the RealSense cameras need libusb and are skipped without it: sudo apt-get install libusb-1.0-0"; \
+	  fi; \
+	fi
+
 demo: setup  ## calibrate, plan, tip a pentagon over its corner and report, in a simulated laboratory
 	@$(BIN)/extrinsic run experiments/demo.yaml --set world.profile=lab
 
-test: setup browser  ## the default test suite
-	@$(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder tests/experiments tests  # the long ones first
+test: setup browser usb  ## the default test suite
+	@$(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -m 'not slow and not alone' tests/experiments tests  # the long ones first
+	@$(BIN)/python -m pytest -m 'alone and not slow'  # in real time, beside an emulated robot: nothing else at a time
 
-test-slow: setup browser  ## the long tests
+test-slow: setup browser usb  ## the long tests
 	@$(BIN)/python -m pytest -m slow --timeout=1800
 
 fuzz: setup  ## 100 000 cases per decoder, then the CDR and YAML paths by coverage (GUIDED seconds each)

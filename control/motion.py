@@ -41,7 +41,7 @@ class Mover:
         self.pose = np.asarray(start, float)
         self.speed, self.pace = speed, pace
         self._arm, self._clock, self._period = arm, clock, 1.0 / rate
-        self._sequence = 0
+        self._sequence = self._due_ns = 0
         self._tick = tick
 
     @classmethod
@@ -55,8 +55,17 @@ class Mover:
         self._sequence += 1
         self._arm.command(ArmTarget(pose, twist, self._period, self._sequence))
         self.pose = pose
-        self._clock.sleep(self._period)
+        self._clock.sleep(self._period if self._clock.lockstep else self._until_due())
         self._tick()
+
+    def _until_due(self) -> float:
+        """How long until the next set-point is due: what this one took is not to slow the motion down.
+
+        One that is late by more than a period is not made up for: the arm would hurry after it.
+        """
+        now, period = self._clock.now_ns(), round(self._period * 1e9)
+        self._due_ns = max(self._due_ns, now - period) + period
+        return max(self._due_ns - now, 0) * 1e-9
 
     def _ticks(self, seconds: float) -> int:
         """Set-points of a motion that is meant to take ``seconds``."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
+from control.reads import Read, Reads
 from control.witness import TableWitness
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import Arm, ForceTorqueSensor, TactileSensor, TagCamera
@@ -56,16 +59,42 @@ class Observer:
     state: StateEstimator | None = None
     tactile_frames: int = 1
     witness: TableWitness | None = None
+    reads: Reads = field(default_factory=Reads)
+    #: called once a look at the devices is over, with what it was, what it was given or found, and what it went by
+    note: Callable[[str, dict[str, Any], list[Read]], None] | None = None
     #: the state behind the newest `estimate` from the fingers
     felt: State | None = None
     _heard_ns: int = -1
     _zero: Zero | None = None
     _seen: dict[str, tuple[int, TagPose]] = field(default_factory=dict)
+    _looking: bool = False
+
+    @contextmanager
+    def _look(self, act: str, told: dict[str, Any] | None = None) -> Iterator[dict[str, Any]]:
+        """A look at the devices, of which others may be parts; it is noted however it ends."""
+        told = {} if told is None else told
+        if self._looking or self.note is None:
+            yield told
+            return
+        self._looking = True
+        self.reads.begin()
+        try:
+            yield told
+        finally:
+            self._looking = False
+            self.note(act, told, self.reads.end())
 
     def see(self, bodies: tuple[str, ...]) -> dict[str, TagPose | None]:
         """Poses in W of the named bodies from fresh camera frames; None where none of its tags was seen."""
+        with self._look("see") as told:
+            told["bodies"] = list(bodies)
+            found = self._see(bodies)
+            told["found"] = {body: None if pose is None else pose.pose.tolist() for body, pose in found.items()}
+            return found
+
+    def _see(self, bodies: tuple[str, ...]) -> dict[str, TagPose | None]:
         detections: list[TagDetection] = []
-        frames = [self.camera.capture() for _ in range(self.frames)]
+        frames = [self.reads.capture(self.camera) for _ in range(self.frames)]
         trusted = [frame for frame in frames if frame.stamp.status is Status.OK]
         if not trusted:
             _distrust(self.camera.name, "see the tags", frames[-1].stamp.status)
@@ -80,15 +109,15 @@ class Observer:
 
     def arm_pose(self) -> Array:
         """X_W_ee (3,) now. Raises DeviceFault where the arm's own reading is not to be trusted."""
-        reading = self.arm.latest()
+        reading = self.reads.latest(self.arm)
         if reading.stamp.status is not Status.OK:
             _distrust(self.arm.name, "read its pose", reading.stamp.status)
         return reading.pose
 
     def mean_reading(self) -> Array:
         """Mean (6,) of the wrist readings of the last window."""
-        now = self.wrist.latest().stamp.capture_ns
-        readings = self.wrist.since(now - self.window_ns)
+        now = self.reads.latest(self.wrist).stamp.capture_ns
+        readings = self.reads.since(self.wrist, now - self.window_ns)
         try:
             return mean_wrench(readings)
         except ValueError as reason:
@@ -98,6 +127,10 @@ class Observer:
 
     def measure(self) -> PlanarState:
         """Everything at this instant; the arm should be at rest."""
+        with self._look("measure"):
+            return self._measure()
+
+    def _measure(self) -> PlanarState:
         ee = self.arm_pose()
         reading = self.mean_reading()
         seen = self.see(("go", "eo"))
@@ -114,13 +147,15 @@ class Observer:
 
         Raises DeviceFault where no finger has seen the object since the grasp.
         """
-        if self.state is None or not self.fingers:
-            return self.measure()
+        with self._look("estimate"):
+            return self.measure() if self.state is None or not self.fingers else self._estimate(self.state)
+
+    def _estimate(self, state: StateEstimator) -> PlanarState:
         for _ in range(self.tactile_frames):
-            self._feel(self.state)
+            self._feel(state)
         extrinsic = self.see(("eo",))["eo"] if self.tags.get("eo") else None
-        self._push_tag(self.state, "eo")
-        now = self.state.state()
+        self._push_tag(state, "eo")
+        now = state.state()
         if "tactile" not in now.ages:
             raise DeviceFault(
                 ", ".join(finger.sensor.name for finger in self.fingers),
@@ -134,7 +169,7 @@ class Observer:
 
     def _feel(self, state: StateEstimator) -> None:
         """Take in one picture of each finger, and what arm and wrist have said until then."""
-        pictures = [finger.sensor.capture() for finger in self.fingers]
+        pictures = [self.reads.capture(finger.sensor) for finger in self.fingers]
         self._hear(state)
         at = pictures[0].stamp.capture_ns
         prior = state.expected(at)
@@ -143,9 +178,9 @@ class Observer:
 
     def _hear(self, state: StateEstimator) -> None:
         """Take in what arm and wrist have said of late."""
-        newest = self.arm.latest()
+        newest = self.reads.latest(self.arm)
         after = max(self._heard_ns, newest.stamp.capture_ns - _RECENT)
-        poses, wrenches = [*self.arm.since(after), newest], self.wrist.since(after)
+        poses, wrenches = [*self.reads.since(self.arm, after), newest], self.reads.since(self.wrist, after)
         for pose in poses:
             state.push_pose(pose)
         for reading in wrenches:
@@ -172,7 +207,8 @@ class Observer:
 
     def contact(self) -> ContactBelief | None:
         """Where the go is believed to be touched, of `state_now`; None where nobody looks for it."""
-        now = self.state_now()
+        with self._look("contact"):
+            now = self.state_now()
         if now is None or now.contact is None:
             return None
         found = now.contact.hypotheses
@@ -198,9 +234,10 @@ class Observer:
 
     def zero(self, load: FreeAirLoad, X_W_go: Array) -> None:
         """Take the offsets in free air: the wrist's, under the weight of a go at ``X_W_go`` alone, and the table's."""
-        ee = self.arm_pose()
-        self.wrist_sensor = self.wrist_sensor.zeroed(self.mean_reading(), ee, X_W_go, self.grasp, load)
-        now = self.wrist.latest().stamp.capture_ns
+        with self._look("zero", {"X_W_go": np.asarray(X_W_go, float).tolist()}):
+            ee = self.arm_pose()
+            self.wrist_sensor = self.wrist_sensor.zeroed(self.mean_reading(), ee, X_W_go, self.grasp, load)
+            now = self.reads.latest(self.wrist).stamp.capture_ns
         self._zero = Zero(now, ee)
         if self.state is not None:
             self.state.wrist, self.state.zero = self.wrist_sensor, self._zero

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Collection
+from contextlib import suppress
+from typing import Annotated, Any, Literal, Self, cast
 
-from pydantic import Field, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, create_model, model_validator
 
 from drivers.fault import Fault
+from drivers.registry import driver, names
 from drivers.scene import Strict, TagMount, Vector3
-from mechanics.yaml_input import Refusal
+from mechanics.yaml_input import Refusal, nearest, one_of, validated
 
 #: after this long without a sign of life somebody counts as dead [s]: ten seconds are too many beside an arm
 LEASE = 1.0
@@ -89,10 +92,39 @@ class BusConfig(Strict):
         return self
 
 
-class _Device(Strict):
-    backend: Literal["sim"] = "sim"
-    serial: str = "sim"
+class DeviceConfig(BaseModel, frozen=True, extra="forbid"):
+    """What a station file says of any device: its ``kind`` (`drivers.interfaces`), and which ``backend`` makes it."""
 
+    kind: str
+    backend: Literal["sim", "real", "replay"] = "sim"
+    serial: str = "sim"
+    rate: float = Field(default=1.0, gt=0, le=1000, description="readings per second [Hz]")
+
+
+class RealDevice(BaseModel, frozen=True, extra="forbid"):
+    """What a station file says of every real device. ``driver`` names who speaks its protocol (`drivers.registry`).
+
+    A driver's own class is its kind's as well: ``class MyConfig(RealDevice, ForceTorqueConfig, frozen=True)``.
+    """
+
+    backend: Literal["real"] = "real"
+    driver: str
+    serial: str = Field(default="", description="the serial number that it must have; any where this is empty")
+
+
+class ReplayDevice(BaseModel, frozen=True, extra="forbid"):
+    """A device whose streams come from a log, with what the log says of it (`drivers.replay`)."""
+
+    backend: Literal["replay"] = "replay"
+    log: str = Field(min_length=1, description="a run's folder, or its log")
+    stream: str = Field(default="", description="the device's name there; this one's where it is empty")
+    speed: float = Field(
+        default=1.0, ge=0, allow_inf_nan=False, description="over that of the recording; 0: as fast as it is read"
+    )
+    loop: bool = Field(default=False, description="whether it begins again at its end")
+
+
+BACKENDS = ("sim", "real", "replay")
 
 Span = tuple[float, float]
 
@@ -135,7 +167,7 @@ class ArmLimits(Strict):
         return self
 
 
-class ArmConfig(_Device):
+class ArmConfig(DeviceConfig, frozen=True):
     """A position-controlled arm."""
 
     kind: Literal["arm"]
@@ -143,14 +175,14 @@ class ArmConfig(_Device):
     limits: ArmLimits = ArmLimits()
 
 
-class GripperConfig(_Device):
+class GripperConfig(DeviceConfig, frozen=True):
     """A two-finger gripper."""
 
     kind: Literal["gripper"]
     rate: float = Field(default=20.0, gt=0, le=1000)
 
 
-class ForceTorqueConfig(_Device):
+class ForceTorqueConfig(DeviceConfig, frozen=True):
     """A force/torque sensor. ``pose`` is X_ee_sensor for a wrist mount, X_W_sensor for a table mount."""
 
     kind: Literal["force_torque"]
@@ -159,7 +191,7 @@ class ForceTorqueConfig(_Device):
     pose: Vector3 = (0.0, 0.0, 0.0)
 
 
-class TagCameraConfig(_Device):
+class TagCameraConfig(DeviceConfig, frozen=True):
     """A camera that sees the tags. ``position`` and ``look_at`` [m] are in the 3-D world (x right, y away, z up)."""
 
     kind: Literal["tag_camera"]
@@ -175,7 +207,7 @@ def _usual_indentation(given: dict[str, Any]) -> float:
     return 0.0008 if given.get("sensor") == "gelslim" else 0.012
 
 
-class TactileConfig(_Device):
+class TactileConfig(DeviceConfig, frozen=True):
     """A tactile finger. The ``left`` finger looks along +Y at the task plane, the ``right`` one along −Y.
 
     ``indentation`` [m] is how deep the held object's face is pressed into the membrane (usually 12 mm) or gel (0.8 mm).
@@ -190,9 +222,47 @@ class TactileConfig(_Device):
     indentation: float = Field(default_factory=_usual_indentation, gt=0, le=0.03)
 
 
-DeviceConfig = Annotated[
-    ArmConfig | GripperConfig | ForceTorqueConfig | TagCameraConfig | TactileConfig, Field(discriminator="kind")
-]
+SIMULATED: dict[str, type[DeviceConfig]] = {
+    "arm": ArmConfig,
+    "gripper": GripperConfig,
+    "force_torque": ForceTorqueConfig,
+    "tag_camera": TagCameraConfig,
+    "tactile": TactileConfig,
+}
+"""What the station file says of a simulated device, by kind."""
+
+REPLAYED: dict[str, type[DeviceConfig]] = {
+    kind: cast("type[DeviceConfig]", create_model(f"Replayed{model.__name__}", __base__=(ReplayDevice, model)))
+    for kind, model in SIMULATED.items()
+}
+"""And of one that is played back."""
+
+
+def device_model(data: Any) -> type[DeviceConfig]:
+    """What a device's entry in a station file is an entry of. Raises Refusal where it does not say."""
+    if not isinstance(data, dict):
+        return DeviceConfig
+    backend = data.get("backend", "sim")
+    if backend == "real":
+        return driver(_word(data, "driver", names())).config
+    if backend not in BACKENDS:
+        raise Refusal(
+            f"unknown value {str(backend)[:60]!r}", one_of(BACKENDS), nearest(str(backend), BACKENDS), ("backend",)
+        )
+    return (REPLAYED if backend == "replay" else SIMULATED)[_word(data, "kind", SIMULATED)]
+
+
+def _word(data: dict[str, Any], key: str, options: Collection[str]) -> str:
+    if key not in data:
+        raise Refusal("missing key", f"the kind of this entry under {key!r}: {one_of(options)}", at=(key,))
+    found = data[key]
+    if not isinstance(found, str) or found not in options:
+        raise Refusal(f"unknown value {str(found)[:60]!r}", one_of(options), nearest(str(found), options), at=(key,))
+    return found
+
+
+def _device(data: Any) -> DeviceConfig:
+    return data if isinstance(data, DeviceConfig) else validated(device_model(data), data, at=())
 
 
 class LogConfig(Strict):
@@ -208,9 +278,14 @@ class StationConfig(Strict):
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     world: WorldConfig | None = None
     bus: BusConfig = BusConfig()
-    devices: dict[str, DeviceConfig]
+    devices: dict[str, Annotated[SerializeAsAny[DeviceConfig], BeforeValidator(_device)]]
     table_tags: tuple[TagMount, ...] = ()
     log: LogConfig = LogConfig()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether every device is simulated; one with a world whose devices are real is an emulated lab."""
+        return self.world is not None and all(device.backend == "sim" for device in self.devices.values())
 
     @property
     def lease(self) -> float:
@@ -218,6 +293,31 @@ class StationConfig(Strict):
         if self.bus.lease is not None:
             return self.bus.lease
         return LEASE_IN_LOCKSTEP if self.world is not None and self.world.clock == "lockstep" else LEASE
+
+    @classmethod
+    def submodel(cls, key: str, data: dict[str, Any]) -> type[BaseModel] | None:
+        """What stands under ``devices``, which only its data can tell (`mechanics.model_paths`)."""
+        entries = data.get(key)
+        if key != "devices" or not isinstance(entries, dict):
+            return None
+        fields: dict[str, Any] = {}
+        for name, entry in entries.items():
+            with suppress(Refusal):
+                fields[name] = (device_model(entry), ...)
+        return create_model("devices", **fields)
+
+    @model_validator(mode="after")
+    def _of_one_making(self) -> Self:
+        backends = {name: device.backend for name, device in self.devices.items()}
+        if self.world is not None and not self.simulated:
+            other = [name for name, backend in backends.items() if backend != "real"]
+            if other:
+                wrong = f"in an emulated lab every device is real, and {', '.join(other)} is not"
+                raise Refusal(wrong, "backend: real, or sim for all of them", at=("devices", other[0]))
+            if self.world.clock != "realtime":
+                wrong = "real protocols know no lockstep"
+                raise Refusal(wrong, "clock: realtime", at=("world", "clock"))
+        return self
 
     @model_validator(mode="after")
     def _faults_suit(self) -> Self:

@@ -14,7 +14,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self
+from typing import IO, Any, Self
 
 from drivers.config import StationConfig
 from drivers.errors import NotConnected
@@ -66,6 +66,11 @@ class StationHost(ABC):
         """Ask it to end, and see that it does; idempotent."""
 
 
+def _server(config: StationConfig) -> str:
+    """The module that serves a station with a world: simulated devices, or real ones in an emulated lab."""
+    return "drivers.sim.host" if config.simulated else "drivers.emulators.lab"
+
+
 class HostProcess(StationHost):
     """The simulated station as a child process; started by `__enter__`, ended and reaped by `close`.
 
@@ -73,9 +78,10 @@ class HostProcess(StationHost):
     closes in order. It ends by itself when this process dies.
     """
 
-    def __init__(self, config: StationConfig):
+    def __init__(self, config: StationConfig, module: str = ""):
+        """``module`` is what the process runs (`drivers.hosted`); by default what the station asks for."""
         self._process: subprocess.Popen[bytes] | None = None
-        self._config = config
+        self._config, self._module = config, module or _server(config)
         self._said: deque[str] = deque(maxlen=50)
         self._listener: threading.Thread | None = None
 
@@ -98,7 +104,7 @@ class HostProcess(StationHost):
             "bound": threading.current_thread() is threading.main_thread(),
         }
         self._process = process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "drivers.sim.host"],  # -P: a folder that happens to lie here is no package
+            [sys.executable, "-P", "-m", self._module],  # -P: a folder that happens to lie here is no package
             env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (_HERE, os.environ.get("PYTHONPATH"))))},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -125,13 +131,18 @@ class HostProcess(StationHost):
         if not select.select([stdout], [], [], HOST_START)[0]:
             raise NotConnected(self._config.name, asked, f"not ready within {HOST_START:g} s", remedy)
         line = stdout.readline()
+        said: dict[str, Any]
         try:
             said = json.loads(line)
         except ValueError:
             said = {"error": "it ended before it was ready. " + self.last_words()}
         if "ready" not in said:
             child = NotConnected(
-                said.get("device", "host"), said.get("asked", "serve"), said.get("error", "?"), said.get("remedy", "")
+                said.get("device", "host"),
+                said.get("asked", "serve"),
+                said.get("error", "?"),
+                said.get("remedy", ""),
+                children=tuple(NotConnected(*one) for one in said.get("children", [])),
             )
             raise NotConnected(self._config.name, asked, "it failed", remedy, children=(child,))
 

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import json
 import socket
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import cast
 
 import numpy as np
 
 from drivers.config import StationConfig
+from drivers.descriptions import DESCRIPTIONS, LoggedStation
 from drivers.errors import DriverError, NotConnected
 from drivers.hosting import HostProcess, StationHost
-from drivers.interfaces import Arm, Device, ForceTorqueSensor, Gripper, TactileSensor, TagCamera
+from drivers.interfaces import Description
+from drivers.roles import Roles
 from drivers.wire import messages, topics
 from drivers.wire.bus import Bus
 from drivers.wire.client import REMOTES
@@ -37,8 +38,8 @@ _PROBE = 1.0
 _PROTOCOL = 2
 
 
-class Devices(Mapping[str, Device]):
-    """The open devices of a station by name; also by role, where the station has exactly one of a kind.
+class Devices(Roles[RemoteSensor]):
+    """The open devices of a station.
 
     ``simulation`` is None for a station without a world, ``host`` unless this connection started it.
     """
@@ -54,53 +55,10 @@ class Devices(Mapping[str, Device]):
         link: Link,
         watch: Watch,
     ):
-        self.config, self.bus, self.clock, self.simulation, self.host = config, bus, clock, simulation, host
-        self._devices, self._link, self._watch = devices, link, watch
+        super().__init__(config, devices)
+        self.bus, self.clock, self.simulation, self.host = bus, clock, simulation, host
+        self._link, self._watch = link, watch
         self._estimates: Publisher | None = None
-
-    def __getitem__(self, name: str) -> Device:
-        return self._devices[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._devices)
-
-    def __len__(self) -> int:
-        return len(self._devices)
-
-    @property
-    def arm(self) -> Arm:
-        """The arm."""
-        return cast("Arm", self._only("arm"))
-
-    @property
-    def gripper(self) -> Gripper:
-        """The gripper."""
-        return cast("Gripper", self._only("gripper"))
-
-    @property
-    def camera(self) -> TagCamera:
-        """The tag camera."""
-        return cast("TagCamera", self._only("tag_camera"))
-
-    def force_torque(self, mount: str) -> ForceTorqueSensor:
-        """The force/torque sensor that is mounted at ``wrist`` or ``table``."""
-        return cast("ForceTorqueSensor", self._only("force_torque", mount))
-
-    def tactile(self, finger: str) -> TactileSensor:
-        """The tactile sensor of the ``left`` or ``right`` finger."""
-        return cast("TactileSensor", self._only("tactile", finger))
-
-    def _only(self, kind: str, place: str | None = None) -> Device:
-        wanted = kind if place is None else f"{kind} at the {place}"
-        found = [
-            name
-            for name, device in self.config.devices.items()
-            if device.kind == kind and place in (None, getattr(device, "mount", None), getattr(device, "finger", None))
-        ]
-        if len(found) != 1:
-            got = f"the station has {len(found)} of them" if found else "the station has none"
-            raise NotConnected(self.config.name, f"find its {wanted}", got, "Check the devices of the station file")
-        return self._devices[found[0]]
 
     def attach(self, writer: LogWriter) -> None:
         """Log every stream of the station but those that its file omits. When it returns, nothing more is missed."""
@@ -112,8 +70,22 @@ class Devices(Mapping[str, Device]):
             if topic not in omit and topic.removeprefix(prefix) not in omit
         }
         writer.attach(self.bus, wanted, lockstep=self.clock.lockstep)
-        # the answer comes after the host has heard of the subscriptions
-        self._link.ask(topics.WORLD, "describe", watch=self._watch)
+        # the answer comes after who serves has heard of the subscriptions
+        for server in [topics.WORLD] if self.config.world is not None else self._devices:
+            self._link.ask(server, "describe", watch=self._watch)
+        self.tell_descriptions(writer)
+
+    def tell_descriptions(self, writer: LogWriter) -> None:
+        """Put what each device says of itself into the log, so that it can be played back (`drivers.replay`).
+
+        A simulated world says some of it only once it was reset. A device that does not answer is left out.
+        """
+        said: dict[str, Description] = {}
+        for name, device in self.items():
+            with suppress(DriverError):
+                said[name] = device.describe()
+        told = LoggedStation(self.config.name, self.clock.lockstep, said)
+        writer.add_attachment(DESCRIPTIONS, "application/json", told.as_json())
 
     def tell_wrench(self, wrench: Array) -> None:
         """Publish the wrench (fx, fy, τ) that the fingers tell, axes of W: a second witness of the arm's gates."""
@@ -176,7 +148,7 @@ class Connection:
         endpoint = config.bus.endpoint
         routed = config.bus.mode == "client"
         if not listening(endpoint):
-            if routed or config.world is None or any(device.backend != "sim" for device in config.devices.values()):
+            if routed or config.world is None:
                 starting = "the router with `extrinsic lab router" if routed else "the station with `extrinsic serve"
                 raise NotConnected(
                     config.name,
@@ -189,7 +161,10 @@ class Connection:
         bus = None if self.host is None else self.host.bus
         if bus is None:
             bus = stack.enter_context(station_bus(config, "runner"))
-        watch = bus.watch(topics.alive(config.name, topics.WORLD))
+        link = Link(bus, config.name)
+        # a station without a world has nobody who speaks for all of it: its arm stands for it, or else its first device
+        head = next((n for n, d in config.devices.items() if d.kind == "arm"), next(iter(config.devices)))
+        watch = bus.watch(topics.alive(config.name, topics.WORLD if config.world is not None else head))
         stack.callback(self._abandon, watch)
         if not watch.seen(config.bus.timeout):
             raise NotConnected(
@@ -200,10 +175,10 @@ class Connection:
                 if routed
                 else "Another station or program has the port; change bus.endpoint or end it",
             )
-        link = Link(bus, config.name)
-        reply = link.ask(topics.WORLD, "describe", watch=watch)
-        _agree(config, json.loads(reply.text))
-        link.now_ns = reply.now_ns
+        if config.world is not None:
+            reply = link.ask(topics.WORLD, "describe", watch=watch)
+            _agree(config, json.loads(reply.text))
+            link.now_ns = reply.now_ns
         lockstep = config.world is not None and config.world.clock == "lockstep"
         devices = {name: REMOTES[device.kind](name, link, lockstep) for name, device in config.devices.items()}
         failures: list[DriverError] = []
@@ -211,6 +186,8 @@ class Connection:
             try:
                 device.connect(config.bus.timeout)
                 stack.callback(device.close)
+                if config.world is None:
+                    _agree_on(config, device.name, link)
             except DriverError as error:
                 failures.append(error)
         if failures:
@@ -239,6 +216,19 @@ def listening(endpoint: str) -> bool:
             return True
     except OSError:
         return False
+
+
+def _agree_on(config: StationConfig, name: str, link: Link) -> None:
+    """Refuse the server of a device that has another idea of it. Raises NotConnected."""
+    mine, theirs = config.devices[name].model_dump(mode="json"), json.loads(link.ask(name, "settings").text)
+    differing = sorted(key for key in mine.keys() | theirs.keys() if mine.get(key) != theirs.get(key))
+    if differing:
+        raise NotConnected(
+            name,
+            f"join its server at {config.bus.endpoint}",
+            f"it was started from a station file with another {', '.join(differing)}",
+            "Use one station file on every machine, and start the server again",
+        )
 
 
 def _agree(config: StationConfig, said: dict) -> None:

@@ -106,15 +106,19 @@ def serve(
     ] = False,
 ) -> None:
     """Put a station's devices on the bus, until Ctrl-C."""
-    from drivers.sim.host import serve as serve_simulated
     from experiments.files import load_station
+    from experiments.serve import serve as serve_station
 
-    config = load_station(station, sets or [], devices or None)
-    if insecure:
-        config = config.model_copy(update={"bus": config.bus.model_copy(update={"insecure": True})})
-    console = Console(stderr=True)
-    what = f"serving {', '.join(config.devices)} at {config.bus.endpoint}; Ctrl-C ends it"
-    raise typer.Exit(serve_simulated(config, lambda _host: console.print(what, highlight=False, soft_wrap=True)))
+    raise typer.Exit(serve_station(load_station(station, sets or [], devices or None), insecure=insecure))
+
+
+@command("extrinsic emulate emulated_lab")
+def emulate(station: StationName, sets: Sets = None) -> None:
+    """Start an emulated lab: a simulated plant behind devices that the real backends speak to, until Ctrl-C."""
+    from experiments.files import load_station
+    from experiments.serve import emulate as emulate_lab
+
+    raise typer.Exit(emulate_lab(load_station(station, sets or [])))
 
 
 @command("extrinsic status sim")
@@ -151,6 +155,41 @@ def recover(station: StationName, sets: Sets = None) -> None:
         Console().print(f"{arm.name} {said}", soft_wrap=True, highlight=False)
 
 
+@command("extrinsic check-device lab1.yaml wrist_ft", name="check-device")
+def check_device(
+    station: StationName,
+    device: Annotated[str, typer.Argument(metavar="DEVICE", help="The device's name in the station file.")],
+    step: Annotated[
+        list[str] | None, typer.Option("--step", metavar="STEP", help="Take this step only; may be repeated.")
+    ] = None,
+    move: Annotated[bool, typer.Option("--move", help="Let it move: an arm 5 mm, a gripper open and close.")] = False,
+    reference: Annotated[
+        Path | None,
+        typer.Option("--reference", metavar="FILE", help="Take a finger's picture, untouched, into FILE (PNG)."),
+    ] = None,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Ask nobody: agree to what is asked for, leave out what needs a hand.")
+    ] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the findings as JSON.")
+    ] = None,
+    sets: Sets = None,
+) -> None:
+    """Walk through the bring-up of one device: what to look at, what is measured, what it is worth."""
+    from experiments.check_device.checklist import check_device as walk_through
+    from experiments.check_device.person import whoever_is_here
+    from experiments.files import load_station
+
+    load_station(station, sets or [], [device])  # refuses one that the station has not
+    config, console = load_station(station, sets or []), Console()
+    person = whoever_is_here(console, yes=yes)
+    steps = tuple(step or ())
+    code = walk_through(
+        config, device, person, console, move=move, reference=reference, only=steps, json_file=json_file
+    )
+    raise typer.Exit(code)
+
+
 @command("extrinsic report runs/grasped_pivoting-20260101T120000.000000")
 def report(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
@@ -174,11 +213,27 @@ def repair(
     mending.say(mending.repair(run_folder), Console())
 
 
+@command("extrinsic replay runs/grasped_pivoting-20260101T120000.000000 --check")
+def replay(
+    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Write the estimates as JSON.")
+    ] = None,
+    check_same: Annotated[bool, typer.Option("--check", help="Exit with 1 when an estimate differs.")] = False,
+) -> None:
+    """Estimate a recorded run again, from its log, with the code of today; show what differs."""
+    from experiments import replay as replaying
+    from experiments.run_folder import RunFolder
+
+    raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, Console()))
+
+
 @command("extrinsic bench sim --check")
 def bench(
-    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="Which benchmark: sim, estimation, planning, load.")],
+    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="sim, estimation, planning, load or bus.")],
     runs: Annotated[
-        int | None, typer.Option("--runs", min=1, help="Measurements per figure, 5; the median counts. Not of `load`.")
+        int | None,
+        typer.Option("--runs", min=1, help="Measurements per figure of sim, estimation, planning; 5."),
     ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write BENCHMARK.json into DIR.")] = None,
@@ -187,7 +242,8 @@ def bench(
         str | None, typer.Option("--horizons", metavar="K,...", help="Steps of the problems of `planning`.")
     ] = None,
     minutes: Annotated[
-        float | None, typer.Option("--minutes", min=0.1, max=10_000, help="How long `load` runs in real time; 20.")
+        float | None,
+        typer.Option("--minutes", min=0.1, max=10_000, help="How long `load` runs, 20, and `bus` each way, 1."),
     ] = None,
     viewers: Annotated[
         int | None, typer.Option("--viewers", min=1, max=100, help="Who looks on, now and then, in `load`; 4.")

@@ -20,13 +20,14 @@ Sets = Annotated[
 ]
 
 
-def commands(app: typer.Typer) -> Callable[[str], Callable[[Command], Command]]:
+def commands(app: typer.Typer) -> Callable[..., Callable[[Command], Command]]:
     """What registers a command of ``app``: ``command = commands(app)``, then ``@command("extrinsic run ...")``.
 
-    Each way to fail ends with its exit code and one clear message.
+    ``name`` is the command's where that is not the function's. Each way to fail ends with its exit code and one clear
+    message.
     """
 
-    def command(example: str) -> Callable[[Command], Command]:
+    def command(example: str, name: str | None = None) -> Callable[[Command], Command]:
         def register(function: Command) -> Command:
             @wraps(function)
             def orderly(*arguments: Any, **options: Any) -> None:
@@ -45,7 +46,7 @@ def commands(app: typer.Typer) -> Callable[[str], Callable[[Command], Command]]:
                 except KeyboardInterrupt:
                     raise typer.Exit(ExitCode.INTERRUPTED) from None
 
-            app.command(epilog=f"Example: {example}")(orderly)
+            app.command(name, epilog=f"Example: {example}")(orderly)
             return function
 
         return register

@@ -18,14 +18,14 @@ from drivers.hosting import HostProcess
 from drivers.scene import Scene
 from drivers.station import Devices, Hosting, Station
 from drivers.wire.log import LogWriter
-from experiments import disk, setup
+from experiments import disk, looks, setup
 from experiments.calibrate import store
 from experiments.calibrate.models import Calibration
 from experiments.calibrate.store import Calibrations
 from experiments.files import Resolved
 from experiments.progress import Progress
 from experiments.run_folder import RunFolder, write_json
-from mechanics.records import EventRecord, PhaseRecord, TrialRecord, WaypointRecord
+from mechanics.records import EventRecord, LookRecord, PhaseRecord, TrialRecord, WaypointRecord
 from planning.plan import Plan
 from planning.skills.base import SkillTask
 
@@ -36,7 +36,7 @@ WARM_UP = 0.2
 #: figures of the plant's health that count up; of the others the worst counts
 _SUMS = ("seconds", "resting_seconds", "contact_changes")
 
-Record = EventRecord | PhaseRecord | TrialRecord | WaypointRecord
+Record = EventRecord | LookRecord | PhaseRecord | TrialRecord | WaypointRecord
 
 
 class RunContext:
@@ -90,6 +90,7 @@ class RunContext:
                         None if world is None else world.model_dump(),
                         max(0, self._begin_ns - round(WARM_UP * 1e9)),
                     )
+                    devices.tell_descriptions(self.log)  # that of this laboratory's tool among them
                 devices.clock.sleep(WARM_UP)
             self._devices = devices
             self._look_at_clocks(devices)
@@ -152,6 +153,7 @@ class RunContext:
             from experiments.fingers import fingers
 
             self._fingers = fingers(self.resolved, self.devices())
+            looks.write(self, "", "fingers")
         return self._fingers
 
     @property

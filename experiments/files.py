@@ -17,11 +17,11 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
 import experiments
-from drivers.config import StationConfig
+from drivers.config import StationConfig, TactileConfig
 from drivers.sim.mismatch import load_profile, profile_names
 from experiments.schema import Experiment
 from mechanics import model_paths
-from mechanics.catalogue import CATALOGUE, SENSORS, ObjectModel, SensorModel
+from mechanics.catalogue import CATALOGUE, SENSORS, ObjectModel, SensorModel, load_sensor
 from mechanics.readings import Array
 from mechanics.yaml_input import (
     Document,
@@ -39,6 +39,10 @@ from mechanics.yaml_input import (
 PACKAGE = Path(experiments.__file__).parent
 EXPERIMENTS = (PACKAGE, PACKAGE.parent)  # the latter for `experiments/grasped_pivoting.yaml` from anywhere
 STATIONS = (Path("stations"), PACKAGE / "stations", PACKAGE)
+
+#: where fingers hold a tall box by default, above its centroid [mm]: an end of it stays in the picture; and a side with
+#: it, which the smaller picture of a GelSlim needs
+CENTRE_MM, GEL_CENTRE_MM = (0.0, 45.0), (10.0, 62.0)
 
 _SET_FORM = "key=value, such as trial.ramp=0.3"
 
@@ -62,7 +66,15 @@ class Resolved:
     def grasp(self) -> Array:
         """X_go_gocf (3,) = (x, y, θ) [m, m, rad]."""
         grasp = self.experiment.grasp
-        return np.array([*(v * 1e-3 for v in grasp.centre_mm), np.radians(grasp.angle_deg)])
+        return np.array([*(v * 1e-3 for v in self.grasp_centre_mm), np.radians(grasp.angle_deg)])
+
+    @property
+    def grasp_centre_mm(self) -> tuple[float, float]:
+        """Where the fingers hold the object, in its frame; what ``auto`` comes to with the station's fingers."""
+        asked = self.experiment.grasp.centre_mm
+        if asked != "auto":
+            return asked
+        return GEL_CENTRE_MM if finger_kinds(self.station) == ("gelslim",) else CENTRE_MM
 
     @property
     def friction(self) -> dict[str, float]:
@@ -103,7 +115,7 @@ def load(experiment: str, station: str | None = None, sets: Sequence[str] = ()) 
         config,
         _object(document, "grasped_object", model.grasped_object),
         None if model.extrinsic_object is None else _object(document, "extrinsic_object", model.extrinsic_object),
-        _sensor(document, model.sensor),
+        _sensor(document, model.sensor, config),
         document,
         station_document,
     )
@@ -140,6 +152,7 @@ def dump_resolved(resolved: Resolved) -> str:
     inlined: dict[str, Any] = {"sensor": resolved.sensor, "grasped_object": resolved.grasped}
     if resolved.extrinsic is not None:
         inlined["extrinsic_object"] = resolved.extrinsic
+    inlined["grasp"] = resolved.experiment.grasp.model_copy(update={"centre_mm": resolved.grasp_centre_mm})
     experiment = resolved.experiment.model_copy(update=inlined)
     data = {"experiment": experiment.model_dump(mode="json"), "station": resolved.station.model_dump(mode="json")}
     yaml = YAML()
@@ -253,10 +266,22 @@ def _object(document: Document, key: str, reference: str | ObjectModel) -> Objec
     return parse(ObjectModel, _followed(document, key, "object", [CATALOGUE], [CATALOGUE]))
 
 
-def _sensor(document: Document, reference: str | SensorModel) -> SensorModel:
+def finger_kinds(station: StationConfig) -> tuple[str, ...]:
+    """What the tactile fingers of a station are, each kind once."""
+    return tuple(dict.fromkeys(d.sensor for d in station.devices.values() if isinstance(d, TactileConfig)))
+
+
+def _sensor(document: Document, reference: str | SensorModel, station: StationConfig) -> SensorModel:
+    """The sensor's file; ``auto`` is that of the station's fingers, a Soft Bubble's where it has none."""
     if isinstance(reference, SensorModel):
         return reference
-    return parse(SensorModel, _followed(document, "sensor", "sensor", [SENSORS], [SENSORS], "soft_bubble"))
+    if reference == "auto":
+        kinds = finger_kinds(station)
+        if len(kinds) > 1:
+            wrong = f"station {station.name} has fingers of several kinds"
+            raise InputError([document.problem(("sensor",), wrong, one_of(kinds))])
+        return load_sensor(kinds[0] if kinds else "soft_bubble")
+    return parse(SensorModel, _followed(document, "sensor", "sensor", [SENSORS], [SENSORS]))
 
 
 # -- what no file can know of itself -----------------------------------------------------------------------------------

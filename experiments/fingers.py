@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from control.observe import Finger
-from drivers.station import Devices
+from drivers.config import TactileConfig
+from drivers.roles import Roles
 from estimation.tactile_pose import FingerModel, TactilePoseEstimator
 from experiments.files import Resolved
 
@@ -20,11 +21,11 @@ def method(model: FingerModel, resolved: Resolved) -> TactilePoseEstimator:
     return RidgeStrips(model, outline)
 
 
-def fingers(resolved: Resolved, devices: Devices) -> tuple[Finger, ...]:
+def fingers(resolved: Resolved, devices: Roles) -> tuple[Finger, ...]:
     """Every tactile finger of the station, with its untouched picture taken."""
     found = []
     for name, config in resolved.station.devices.items():
-        if config.kind == "tactile":
+        if isinstance(config, TactileConfig):
             sensor = devices.tactile(config.finger)
             model = FingerModel.of(devices[name].describe().extra, sensor.reference())
             found.append(Finger(sensor, method(model, resolved)))

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from drivers.wire.log_repair import MENDED, mended_path
+from drivers.wire.log_repair import to_read, written_logs
 from mechanics.yaml_input import InputError, Problem
-
-_LOG = re.compile(rf"log(?:\.([0-9]{{1,9}}))?(?:{re.escape(MENDED)})?\.mcap")
 
 
 class RunFolder:
@@ -54,12 +51,11 @@ class RunFolder:
 
         One of which only the mended form is left is among them.
         """
-        found = {int(match[1] or 0) for file in self.path.glob("log*.mcap") if (match := _LOG.fullmatch(file.name))}
-        return [self.path / (f"log.{number}.mcap" if number else "log.mcap") for number in sorted(found)]
+        return written_logs(self.path)
 
     def logs(self) -> list[Path]:
         """The logs to read, in their order: each in its mended form, where there is one."""
-        return [mended if (mended := mended_path(log)).is_file() else log for log in self.written_logs()]
+        return [to_read(log) for log in self.written_logs()]
 
     @classmethod
     def open(cls, path: Path) -> RunFolder:

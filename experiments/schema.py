@@ -43,9 +43,12 @@ class _Model(BaseModel):
 
 
 class GraspConfig(_Model):
-    """Where the fingers hold the object: X_go_gocf, in the object's frame (origin: its centroid)."""
+    """Where the fingers hold the object: X_go_gocf, in the object's frame (origin: its centroid).
 
-    centre_mm: Vector2 = (0.0, 45.0)
+    ``auto``: so that an end of a tall box stays in the tactile picture, and for a GelSlim's smaller one a side, too.
+    """
+
+    centre_mm: Vector2 | Literal["auto"] = "auto"
     angle_deg: float = Field(default=0.0, ge=-180, le=180)
 
 
@@ -135,7 +138,7 @@ class Experiment(_Model):
     name: Slug
     station: str = Field(default="sim", min_length=1, max_length=1000)
     seed: int = Field(default=0, ge=0, lt=2**63)
-    sensor: SensorReference = "soft_bubble"
+    sensor: SensorReference = "auto"
     grasped_object: ObjectReference
     extrinsic_object: ObjectReference | None = None
     grasp: GraspConfig = GraspConfig()

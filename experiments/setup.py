@@ -9,12 +9,13 @@ from typing import Literal
 import numpy as np
 
 from control.observe import Finger, Observer
+from control.reads import Reads
 from control.settings import TrialSettings
 from control.witness import TableWitness
 from drivers.config import ForceTorqueConfig
 from drivers.errors import DriverError
+from drivers.roles import Roles
 from drivers.scene import Body, Scene, TagMount
-from drivers.station import Devices
 from estimation.contact_filter import ContactFilter
 from estimation.contact_location import ContactLocator
 from estimation.contact_tracking import ContactTracker
@@ -160,10 +161,10 @@ def contact_tracker(resolved: Resolved, known: Believed) -> ContactTracker:
     return ContactTracker(particles, mu, None if resolved.extrinsic is None else resolved.extrinsic.polygon)
 
 
-def warm_up(resolved: Resolved, known: Believed, fingers: tuple[Finger, ...] = ()) -> None:
+def warm_up(resolved: Resolved, known: Believed, fingers: tuple[Finger, ...] = (), reads: Reads | None = None) -> None:
     """Estimate once what trials estimate: the first time on a machine compiles for seconds, and no arm may wait then.
 
-    A finger that fails is left for the trial to name.
+    A finger that fails is left for the trial to name. The fingers are read by ``reads``.
     """
     wrench = EnvironmentWrench.of([0.0, 10.0, 0.0], np.diag([0.1, 0.1, 0.01]), np.zeros(2))
     go = np.array([0.0, resolved.grasped.polygon.bounding_radius, 0.0])
@@ -171,10 +172,10 @@ def warm_up(resolved: Resolved, known: Believed, fingers: tuple[Finger, ...] = (
     prior = GraspFilter(resolved.grasp).predicted(0, np.zeros(3))
     for finger in fingers:
         with suppress(DriverError):
-            finger.method.estimate(finger.sensor.capture(), prior)
+            finger.method.estimate((reads or Reads()).capture(finger.sensor), prior)
 
 
-def _witness(resolved: Resolved, devices: Devices, settings: TrialSettings) -> TableWitness | None:
+def _witness(resolved: Resolved, devices: Roles, settings: TrialSettings) -> TableWitness | None:
     """The sensor under the table, where the station has one."""
     mounts = [d.mount for d in resolved.station.devices.values() if isinstance(d, ForceTorqueConfig)]
     if mounts.count("table") != 1:
@@ -190,7 +191,7 @@ def _witness(resolved: Resolved, devices: Devices, settings: TrialSettings) -> T
 
 
 def observer(
-    resolved: Resolved, devices: Devices, settings: TrialSettings, known: Believed, fingers: tuple[Finger, ...] = ()
+    resolved: Resolved, devices: Roles, settings: TrialSettings, known: Believed, fingers: tuple[Finger, ...] = ()
 ) -> Observer:
     """The eyes of a trial: arm, wrist sensor, camera and ``fingers``, with what is known of them and a fresh grasp.
 

@@ -13,10 +13,11 @@ from typing import Any
 
 from control.base import Controller
 from control.observe import Finger
+from control.reads import Reads
 from control.trial import Trial, TrialResult, Watch
 from drivers.errors import DeviceTimeout, DriverError, SimulationDiverged
 from drivers.station import Devices
-from experiments import kernels, registries, setup
+from experiments import kernels, looks, registries, setup
 from experiments.arrange import arrange, hold
 from experiments.context import RunContext
 from experiments.faults.inject import Injector
@@ -95,7 +96,10 @@ def _warm_up(context: RunContext, stage: ExecuteStage) -> None:
                 continue
             except DriverError:  # the trial will meet it again, and name it
                 break
-    setup.warm_up(context.resolved, context.believed, fingers)
+    reads = Reads()
+    reads.begin()
+    setup.warm_up(context.resolved, context.believed, fingers, reads)
+    looks.write(context, "", "warm_up", {}, reads.end())
     if any(registries.controllers()[name].needs_task for name in stage.controllers):
         kernels.warm()
 
@@ -152,6 +156,7 @@ def _one_trial(
             arrange(context, devices, plan, trial)
             fingers = context.fingers() if controller.feedback else ()  # nobody else asks where the go is
             observer = setup.observer(there, devices, context.settings, context.believed, fingers)
+            looks.note(context, observer, name, extrinsic=there.extrinsic is not None)
             result = Trial(name, plan, made, observer, clock, load, context.settings, watch).run()
         except SimulationDiverged as error:
             result = TrialResult("diverged", str(error), plan)

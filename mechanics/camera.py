@@ -32,7 +32,9 @@ def rigid(name: str, X_AB: ArrayLike) -> Array:
     if X_AB.shape != (4, 4) or not np.isfinite(X_AB).all():
         raise ValueError(f"{name}: expected 4 x 4 finite numbers, got {X_AB.tolist()}")
     R = X_AB[:3, :3]
-    if not (np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0):
+    with np.errstate(all="ignore"):  # of figures that no rotation has
+        rotation = np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0
+    if not rotation:
         raise ValueError(f"{name}: expected a rotation in the upper left 3 x 3 block")
     if not np.array_equal(X_AB[3], (0, 0, 0, 1)):
         raise ValueError(f"{name}: expected last row (0, 0, 0, 1), got {X_AB[3].tolist()}")

@@ -80,12 +80,16 @@ class TagDetection:
 
     ``corners`` is (4, 2) [px] in the tag's own order: (−,−), (+,−), (+,+), (−,+) in the tag frame, whose x points
     right and y up when the tag is seen upright. Pixel centres lie at integer coordinates (OpenCV's convention).
+
+    ``ambiguity`` is that of the tag's pose in space, from 0 to 1 (`mechanics.square_pose`); None where nobody looked.
+    A pose in the task plane has none.
     """
 
     id: int
     corners: Array
     hamming: int
     margin: float
+    ambiguity: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,3 +87,34 @@ class EventRecord:
     capture_ns: int
     level: str
     text: str
+
+
+@dataclass(frozen=True, slots=True)
+class LookRecord:
+    """Somebody has looked at the devices: what it was (``act``), for whom, and the readings that it went by.
+
+    ``sources`` are the devices that were read, in their order, with ``stamps`` [ns], the capture time of the newest
+    reading that was taken from each, and ``sequences``, its sequence number. ``told`` is JSON: what the look was given,
+    and what came of it that no other record has. With it the look can be taken again (`experiments.replay`).
+    """
+
+    capture_ns: int
+    trial: str
+    act: str
+    told: str = "{}"
+    sources: tuple[str, ...] = ()
+    stamps: tuple[int, ...] = ()
+    sequences: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class StatusRecord:
+    """From its message ``sequence`` on a stream's readings have another ``status`` (`mechanics.readings.Status`).
+
+    A stream begins as OK; in a log this stands before the message.
+    """
+
+    capture_ns: int
+    stream: str
+    sequence: int
+    status: int

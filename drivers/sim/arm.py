@@ -176,8 +176,11 @@ class SimArm(Simulated[PoseReading], Arm):
         sx, sy, st = (s * d for s, d in zip(self._spread, draws, strict=True))
         self._error_before, self._error_step, self._building = self._error, (sx - x, sy - y, st - t), 0.0
 
-    def _follow(self, pose: Pose, twist: Pose, duration: float) -> None:
-        """Cubic Hermite from the present aim and its twist to the given ones."""
+    def follow(self, pose: Pose, twist: Pose, duration: float) -> None:
+        """Cubic Hermite from the present aim and its twist to the given ones, ``duration`` seconds from now.
+
+        This is the motion itself, without lease, stop or checks: `command` is for whoever commands the arm.
+        """
         T = duration
         x, y, angle = self._aim
         # the nearest turn of the target's angle, so that the arm never unwinds
@@ -233,7 +236,7 @@ class SimArm(Simulated[PoseReading], Arm):
             raise CommandRefused(self.name, "command", f"not finite: {target}", "Look for a NaN in what computed it")
         if target.duration <= 0:
             raise CommandRefused(self.name, "command", f"the duration must be positive, it is {target.duration:g} s")
-        self._follow(tuple(pose.tolist()), tuple(twist.tolist()), float(target.duration))
+        self.follow(tuple(pose.tolist()), tuple(twist.tolist()), float(target.duration))
 
     def hold(self) -> None:
         """Stay where the arm is now."""

@@ -9,11 +9,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drivers.finger_frames import (
+    BUBBLE_DISTANCE,
+    BUBBLE_DOME,
+    BUBBLE_SHIFT,
+    DEPTH_UNIT,
+    REALSENSE_FOCAL,
+    bubble_camera_pose,
+)
 from mechanics.camera import CameraModel
 from mechanics.readings import Array
 
-DEPTH_UNIT = 1e-4
-"""One step of a depth image [m]."""
+__all__ = ["DEPTH_UNIT", "DOME", "DepthCamera", "Dome", "camera_of"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,9 +31,9 @@ class Dome:
     the gas's bulk modulus over its volume and the membrane's tension.
     """
 
-    a: float = 0.0557
-    b: float = 0.0406
-    top: float = 0.041
+    a: float = BUBBLE_DOME[0]
+    b: float = BUBBLE_DOME[1]
+    top: float = BUBBLE_DOME[2]
     gas: float = 1.5e6
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
@@ -57,7 +64,7 @@ class DepthCamera:
     width: int
     height: int
     focal: float
-    distance: float = 0.1
+    distance: float = BUBBLE_DISTANCE
     shift: float = 0.0
 
     @property
@@ -71,8 +78,7 @@ class DepthCamera:
         """As a CameraModel whose world is the finger's frame (`drivers.sim.soft_bubble.SimSoftBubble`)."""
         f, cx, cy = self.focal, 0.5 * (self.width - 1), 0.5 * (self.height - 1)
         K = np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
-        X_FC = np.array([[0, 1, 0, 0], [1, 0, 0, -self.shift], [0, 0, -1, self.distance], [0, 0, 0, 1]], float)
-        return CameraModel(self.width, self.height, K, X_WC=X_FC)
+        return CameraModel(self.width, self.height, K, X_WC=bubble_camera_pose(self.distance, self.shift))
 
 
 def camera_of(width: int, height: int) -> DepthCamera:
@@ -83,4 +89,4 @@ def camera_of(width: int, height: int) -> DepthCamera:
     """
     if width < 320:
         return DepthCamera("pico flexx", "time_of_flight", width, height, 0.5 * width / tan(radians(31)))
-    return DepthCamera("RealSense", "stereo", width, height, 434.0 * width / 640.0, shift=0.021)
+    return DepthCamera("RealSense", "stereo", width, height, REALSENSE_FOCAL * width / 640.0, shift=BUBBLE_SHIFT)

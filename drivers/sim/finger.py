@@ -4,16 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from drivers.finger_frames import X_EE_FINGER
 from mechanics.readings import Array
 
-X_EE_FINGER = {
-    "left": ((1.0, 0, 0, 0), (0, 0, -1.0, 0), (0, 1.0, 0, 0), (0, 0, 0, 1.0)),
-    "right": ((-1.0, 0, 0, 0), (0, 0, 1.0, 0), (0, 1.0, 0, 0), (0, 0, 0, 1.0)),
-}
-"""Poses (4, 4) of the fingers' frames in ee, whose 3-D axes are X right, Y away from the viewer, Z up.
-
-x and y of a finger's frame are right and up as one sees the object from it, z points from the object into the finger.
-"""
+__all__ = ["X_EE_FINGER", "FingerView"]
 
 
 @dataclass(frozen=True, slots=True)

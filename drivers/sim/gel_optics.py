@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.finger_frames import gel_camera
 from drivers.sim.gel import Floats, PressedGel, at_rest
 from mechanics.camera import CameraModel
 from mechanics.readings import Array
@@ -63,13 +64,7 @@ class GelSlimOptics:
 
     def camera(self, width: int, height: int) -> CameraModel:
         """The camera with a picture of ``width`` by ``height`` pixels; its world is the finger's frame."""
-        focal = width * self.distance / self.view
-        c, s = np.cos(self.tilt), np.sin(self.tilt)
-        X_FC = np.eye(4)
-        X_FC[:3, :3] = np.column_stack(((1, 0, 0), (0, -c, -s), (0, s, -c)))  # it looks along −z, slightly up
-        X_FC[:3, 3] = -self.distance * X_FC[:3, 2]
-        K = np.array([[focal, 0, 0.5 * (width - 1)], [0, focal, 0.5 * (height - 1)], [0, 0, 1]])
-        return CameraModel(width, height, K, np.array([self.bend, 0, 0, 0, 0]), X_FC)
+        return gel_camera(width, height, view=self.view, distance=self.distance, tilt=self.tilt, bend=self.bend)
 
     def markers(self, width: int, height: int) -> Array:
         """Where the markers are in the gel at rest (n, 2) [m], row by row: a grid about the origin wider than the view.

@@ -3,15 +3,11 @@
 One thread owns the world: there the main thread. Handlers of the bus only put work into its inbox; in lockstep the
 world advances when it is asked to, in real time it is paced by absolute deadlines with work done between the steps.
 
-As a process of its own it reads one line of JSON from standard input (``{"config": …, "orphan": bool}``), answers with
-one line (``{"ready": pid}`` or ``{"error": …}``) and ends when standard input does, at SIGTERM or SIGINT: arm held,
-session closed, exit code 0.
+As a process of its own it is told what to serve and ends as `drivers.hosted` has it: arm held, session closed.
 """
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import json
 import logging
 import os
@@ -21,14 +17,15 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 
 import numpy as np
 from pydantic import ValidationError
 
+from drivers import hosted
 from drivers.config import StationConfig, WorldConfig
-from drivers.errors import CommandRefused, DriverError, NotConnected
+from drivers.errors import CommandRefused
 from drivers.interfaces import Arm, ForceTorqueSensor, ImagingSensor
 from drivers.scene import Scene
 from drivers.sim.faults import Faulty
@@ -125,6 +122,8 @@ class Host:
         self._servers: dict[str, DeviceServer] = {}
         self._due: dict[str, float] = {}  # when a camera takes its next frame in real time [s]
         self.world.faults.on_crash = crash
+        #: a world in real time that is later than this gives up the lost time [s]
+        self.longest_lag = _LAG
 
     def _now_ns(self) -> int:
         return self.world.now_ns() + self.skipped_ns
@@ -142,8 +141,7 @@ class Host:
         What ends it otherwise is raised, and given to ``failed`` before the devices vanish from the bus.
         """
         with ExitStack() as stack:
-            stack.callback(self._withdraw)
-            self._attend()
+            self._begin(stack)
             self._truth_stream = self.desk.publisher(topics.WORLD, "truth", messages.TRUTH)
             stack.callback(self._truth_stream.close)
             for verb, work in (
@@ -171,6 +169,11 @@ class Host:
             except BaseException as error:
                 failed(error)
                 raise
+
+    def _begin(self, stack: ExitStack) -> None:
+        """Put the devices to work; ``stack`` ends it."""
+        stack.callback(self._withdraw)
+        self._attend()
 
     def _attend(self) -> None:
         """Serve the devices that are there, and no others: a device that has gone takes its server with it."""
@@ -202,7 +205,7 @@ class Host:
         """Bring the world up to the present; returns how long to wait for the next piece [s]."""
         simulated = (self.world.now_ns() - self._origin_ns) * 1e-9
         behind = time.monotonic() - self._anchor - simulated
-        if behind > _LAG:
+        if behind > self.longest_lag:
             self._anchor += behind
             self.skipped_ns += int(behind * 1e9)
             log.warning("%s: the world was %.0f ms late and gave up the lost time", self.config.name, behind * 1e3)
@@ -263,7 +266,7 @@ class Host:
         try:
             scene = Scene.model_validate_json(asked.scene)
             world = WorldConfig.model_validate_json(asked.world) if asked.world else None
-            self.world.reset(asked.seed, scene, world, asked.begin_ns)
+            self.world.reset(asked.seed, self._begun_with(scene), world, asked.begin_ns)
         except (ValidationError, ValueError) as error:
             raise CommandRefused(topics.WORLD, "reset", str(error), "Correct the scene") from error
         self.skipped_ns = 0
@@ -273,6 +276,10 @@ class Host:
         self._truths, self._staged = 0, True
         self._staged_anew()
 
+    def _begun_with(self, scene: Scene) -> Scene:
+        """The scene that the world begins with, where one was asked for."""
+        return scene
+
     def _restage(self, payload: bytes) -> None:
         try:
             asked = json.loads(messages.decode(payload, messages.STRING).data)
@@ -281,6 +288,10 @@ class Host:
             remedy = "Send JSON with scene, part and session"
             raise CommandRefused(topics.WORLD, "restage", repr(error), remedy) from error
         self._refuse_foreign("restage", session)
+        try:
+            scene = self._begun_with(Scene.model_validate(scene))
+        except ValidationError as error:
+            raise CommandRefused(topics.WORLD, "restage", str(error), "Correct the scene") from error
         self.world.restage(scene, part)
         self._staged_anew()
 
@@ -350,13 +361,21 @@ class Host:
         return Answer(type=messages.TRUTH, data=encode_reading(self.world.truth(), self.skipped_ns))
 
 
-def serve(config: StationConfig, ready: Callable[[Host], None] = lambda _: None) -> int:
-    """Serve a simulated station in this process until SIGTERM or SIGINT; returns 0.
+def serve(
+    config: StationConfig,
+    ready: Callable[[Host], None] = lambda _: None,
+    make: Callable[[StationConfig, Bus], Host] = Host,
+    *,
+    routing: bool = False,
+) -> int:
+    """Serve a simulated station in this process until SIGTERM or SIGINT; returns 0. ``make`` makes its host.
+
+    With ``routing`` other processes of this machine may serve devices of the station, too.
 
     Raises NotConnected, ValueError, and InputError where it would listen to strangers.
     """
-    with station_bus(config, "device") as bus:
-        host = Host(config, bus)
+    with station_bus(config, "device", routing=routing) as bus:
+        host = make(config, bus)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: host.stop())
 
@@ -368,55 +387,6 @@ def serve(config: StationConfig, ready: Callable[[Host], None] = lambda _: None)
     return 0
 
 
-def _end_with_input(host: Host) -> None:
-    """Stop the host when the parent has gone and standard input with it."""
-    while os.read(0, 1):
-        pass
-    host.stop()
-
-
-def _die_with_parent() -> None:
-    """Have the kernel send SIGTERM when the parent dies: covers a pipe that a third process keeps open."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGTERM, 0, 0, 0)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry of the process that a `drivers.station.Station` starts; ``argv`` is unused, all comes by the pipe."""
-    line = bytearray()
-    while not line.endswith(b"\n"):
-        byte = os.read(0, 1)
-        if not byte:
-            return 2
-        line += byte
-
-    def tell(**said: object) -> None:
-        sys.stdout.write(json.dumps(said) + "\n")
-        sys.stdout.flush()
-
-    try:
-        order = json.loads(line)
-        config = StationConfig.model_validate(order["config"])
-        if order.get("bound", False):
-            _die_with_parent()
-
-        def ready(host: Host) -> None:
-            gc.collect()
-            gc.freeze()  # what is here now stays: looking through it again and again costs pauses in mid-step
-            threading.Thread(target=_end_with_input, args=(host,), name="parent", daemon=True).start()
-            tell(ready=os.getpid())
-
-        serve(config, ready)
-    except NotConnected as error:
-        tell(error=error.got, device=error.device, asked=error.asked, remedy=error.remedy)
-        return 3
-    except (DriverError, ValueError, KeyError) as error:
-        log.exception("the host failed")
-        tell(error=str(error), device="world", asked="serve", remedy="")
-        return 3
-    return 0
-
-
 if __name__ == "__main__":
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s")
-    sys.exit(main())
+    sys.exit(hosted.main(serve))

@@ -23,7 +23,7 @@ from drivers.sim.mismatch import CameraFigures
 from drivers.sim.screen import Screen
 from drivers.tags import TagDetector, tag_bitmap
 from mechanics.camera import CameraModel, point_in_world
-from mechanics.readings import Array, ImageReading, Stamp, TagDetection, TagReading
+from mechanics.readings import Array, ImageReading, Stamp, Status, TagDetection, TagReading
 from mechanics.se2 import transform
 from mechanics.tag_board import TagBoard
 
@@ -204,7 +204,7 @@ class SimTagCamera(Faulty[TagReading], TagCamera):
         figures = self._figures
         while figures.dropout and self._rng.random() < figures.dropout:
             self._sequence += 1  # a frame that never arrives; the next one is waited for
-        picture, status = self._developed(exposed(self._seen(), figures, self._rng), noisy=figures.noise > 0)
+        picture, status = self.expose()
         now = self._world.now_ns()
         stamp = Stamp(now, now, self._sequence, self.name, status)
         self._sequence += 1
@@ -213,6 +213,11 @@ class SimTagCamera(Faulty[TagReading], TagCamera):
         if figures.latency:
             reading = received(reading, now + round(figures.latency * 1e9))
         return self._hand_out(reading, timeout)
+
+    def expose(self) -> tuple[NDArray[np.uint8], Status]:
+        """A picture (h, w) of this instant, as it leaves the camera, and what it is worth; no tags are looked for."""
+        figures = self._figures
+        return self._developed(exposed(self._seen(), figures, self._rng), noisy=figures.noise > 0)
 
     def image(self) -> ImageReading | None:
         """The picture (mono8) behind the newest `capture`."""

@@ -53,7 +53,8 @@ class Query:
 class Bus:
     """A zenoh session as a context manager. ``endpoint`` is listened at (``listen``) or connected to.
 
-    ``mode``: ``peer`` on one machine, ``client`` toward a router, to whom an ``identity`` shows its certificate.
+    ``mode``: ``peer`` on one machine, ``client`` toward a router, to whom an ``identity`` shows its certificate;
+    ``router`` hands on what others send each other, too.
     ``lease`` [s] is how long a peer may be silent, or not take what it is sent, before it counts as dead; zenoh's own
     ten seconds are too many beside an arm. ``at_once`` is for a session that both ends of a stream share: who publishes
     delivers, too, in its own thread. Raises NotConnected when the session cannot be opened within ``timeout`` seconds.
@@ -64,7 +65,7 @@ class Bus:
         endpoint: str,
         *,
         listen: bool = False,
-        mode: Literal["peer", "client"] = "peer",
+        mode: Literal["peer", "client", "router"] = "peer",
         timeout: float = 5.0,
         shared_memory: bool = True,
         lease: float = 1.0,

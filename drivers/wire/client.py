@@ -13,14 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import CommandRefused, DeviceFault, DeviceTimeout, DriverError
-from drivers.interfaces import (
-    Arm,
-    ArmTarget,
-    ForceTorqueSensor,
-    Gripper,
-    TactileSensor,
-    TagCamera,
-)
+from drivers.interfaces import Arm, ArmTarget, ForceTorqueSensor, Gripper, R, TactileSensor, TagCamera
 from drivers.wire import messages, topics
 from drivers.wire.arm_server import holder_id
 from drivers.wire.codec import decode_reading
@@ -40,31 +33,10 @@ class RemoteForceTorque(RemoteSensor[WrenchReading], ForceTorqueSensor):
         self._command("tare")
 
 
-class RemoteTagCamera(RemoteSensor[TagReading], TagCamera):
-    """A tag camera on the bus. It keeps as many frames as its server does."""
+class RemoteImaging(RemoteSensor[R]):
+    """The half that cameras and tactile fingers on the bus share."""
 
-    kind = "tag_camera"
-    keeps = 256
-
-    def capture(self, timeout: float | None = None) -> TagReading:
-        """As `ImagingSensor.capture`; None: as long as the bus waits for any reply."""
-        timeout = self._link.bus.timeout if timeout is None else timeout
-        self._command("capture", timeout=timeout)
-        return self.latest(timeout)  # the frame is here: a reply comes after what was published before it
-
-    def image(self) -> ImageReading | None:
-        """The picture behind the newest `capture`, without loss."""
-        reply = self._command("image", asked="send its picture")
-        return cast("ImageReading", decode_reading(reply.type, reply.data.tobytes(), 0)) if reply.type else None
-
-
-class RemoteTactile(RemoteSensor[ImageReading], TactileSensor):
-    """A tactile finger on the bus. It keeps fewer readings than others: a picture has up to half a megabyte."""
-
-    kind = "tactile"
-    keeps = 64
-
-    def capture(self, timeout: float | None = None) -> ImageReading:
+    def capture(self, timeout: float | None = None) -> R:
         """As `ImagingSensor.capture`; None: as long as the bus waits for any reply.
 
         A frame that is lost on its way is made up for by the next one of the stream.
@@ -80,6 +52,25 @@ class RemoteTactile(RemoteSensor[ImageReading], TactileSensor):
                     raise DeviceTimeout(self.name, "capture", got, "Check the network's load")
             sample = self._kept[-1]
         return self._decode(sample)
+
+
+class RemoteTagCamera(RemoteImaging[TagReading], TagCamera):
+    """A tag camera on the bus. It keeps as many frames as its server does."""
+
+    kind = "tag_camera"
+    keeps = 256
+
+    def image(self) -> ImageReading | None:
+        """The picture behind the newest `capture`, without loss."""
+        reply = self._command("image", asked="send its picture")
+        return cast("ImageReading", decode_reading(reply.type, reply.data.tobytes(), 0)) if reply.type else None
+
+
+class RemoteTactile(RemoteImaging[ImageReading], TactileSensor):
+    """A tactile finger on the bus. It keeps fewer readings than others: a picture has up to half a megabyte."""
+
+    kind = "tactile"
+    keeps = 64
 
     def reference(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """As `TactileSensor.reference`."""

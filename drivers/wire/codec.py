@@ -32,6 +32,7 @@ from mechanics.readings import (
     TruthReading,
     WrenchReading,
 )
+from mechanics.square_pose import square_homography
 
 Reading = PoseReading | WrenchReading | ImageReading | TagReading | GripperReading | TruthReading
 
@@ -48,7 +49,6 @@ TYPES: dict[type, str] = {
 JPEG_QUALITY = 95
 _OUT_OF_PLANE = 1e-6
 _CHANNELS = {"mono8": (np.uint8, 1), "bgr8": (np.uint8, 3), "16UC1": (np.uint16, 1)}
-_TAG_SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 def encode_reading(reading: Reading, shift_ns: int = 0) -> bytes:
@@ -196,7 +196,7 @@ def _encode_tags(reading: TagReading, header: Any) -> Any:
     """Corners and homography as `TagDetection` states them: tag frame with y up, pixel centres at integers."""
     detections = []
     for found in reading.detections:
-        homography = _homography(found.corners)
+        homography = square_homography(found.corners)
         centre = homography[:2, 2] / homography[2, 2] if homography[2, 2] else found.corners.mean(axis=0)
         points = [messages.message("apriltag_msgs/msg/Point", x=float(x), y=float(y)) for x, y in found.corners]
         detections.append(
@@ -205,7 +205,7 @@ def _encode_tags(reading: TagReading, header: Any) -> Any:
                 family=reading.family,
                 id=found.id,
                 hamming=found.hamming,
-                goodness=0.0,
+                goodness=_goodness(found.ambiguity),
                 decision_margin=found.margin,
                 centre=messages.message("apriltag_msgs/msg/Point", x=float(centre[0]), y=float(centre[1])),
                 corners=points,
@@ -215,18 +215,6 @@ def _encode_tags(reading: TagReading, header: Any) -> Any:
     return messages.message(messages.DETECTIONS, header=header, detections=detections)
 
 
-def _homography(corners: Array) -> Array:
-    """(3, 3) from the tag's square ±1 to pixels; zeros for corners that span no quadrilateral."""
-    rows = []
-    for (x, y), (u, v) in zip(_TAG_SQUARE, corners, strict=True):
-        rows.append([x, y, 1, 0, 0, 0, -u * x, -u * y])
-        rows.append([0, 0, 0, x, y, 1, -v * x, -v * y])
-    try:
-        return np.append(np.linalg.solve(np.array(rows), np.asarray(corners, float).reshape(-1)), 1.0).reshape(3, 3)
-    except np.linalg.LinAlgError:
-        return np.zeros((3, 3))
-
-
 def _decode_tags(payload: bytes, type_name: str, stamp: Stamper) -> TagReading:
     value = messages.decode(payload, type_name)
     families = {found.family for found in value.detections} or {"tag36h11"}
@@ -234,11 +222,27 @@ def _decode_tags(payload: bytes, type_name: str, stamp: Stamper) -> TagReading:
         raise ProtocolError("wire", f"read {type_name}", f"several tag families in one frame: {sorted(families)}", "")
     detections = tuple(
         TagDetection(
-            found.id, np.array([(point.x, point.y) for point in found.corners]), found.hamming, found.decision_margin
+            found.id,
+            np.array([(point.x, point.y) for point in found.corners]),
+            found.hamming,
+            found.decision_margin,
+            _ambiguity(found.goodness),
         )
         for found in value.detections
     )
     return TagReading(_stamped(value.header, stamp), detections, families.pop())
+
+
+_LEAST_GOODNESS = float(np.finfo(np.float32).tiny)
+
+
+def _goodness(ambiguity: float | None) -> float:
+    """1 − ambiguity, in the field that detectors of today leave at 0; 0 itself says that nobody looked."""
+    return 0.0 if ambiguity is None else max(1.0 - ambiguity, _LEAST_GOODNESS)
+
+
+def _ambiguity(goodness: float) -> float | None:
+    return 1.0 - goodness if 0.0 < goodness <= 1.0 else None
 
 
 def _encode_image(reading: ImageReading, header: Any) -> Any:

@@ -17,11 +17,12 @@ from typing import Self
 
 from mcap.writer import CompressionType, Writer
 
-from drivers.errors import DeviceFault
+from drivers.errors import DeviceFault, ProtocolError
 from drivers.wire import messages
 from drivers.wire.bus import Bus
 from drivers.wire.records import STREAMS, Record, encode_record
 from drivers.wire.streams import Sample
+from mechanics.records import StatusRecord
 
 ROOM = 256 * 2**20
 """Bytes that may wait to be written: half a minute of everything, half a gigabyte of a stuck disk's arrears never."""
@@ -49,6 +50,7 @@ class LogWriter:
         self.overflows = 0
         self.failure: DeviceFault | None = None
         self._newest: dict[str, int] = {}
+        self._statuses: dict[str, int] = {}
         self._types: dict[str, str] = {}
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -112,10 +114,8 @@ class LogWriter:
     def write_record(self, record: Record) -> None:
         """File one of the run's own records (`mechanics.records`), under ``run/…``. Raises as `write`."""
         topic, type_name = STREAMS[type(record)]
-        with self._lock:
-            sequence = self._newest[topic] = self._newest.get(topic, -1) + 1
         stamp = record.capture_ns
-        self.write(topic, type_name, encode_record(record), sequence=sequence, publish_ns=stamp, log_ns=stamp)
+        self.write(topic, type_name, encode_record(record), sequence=self._next(topic), publish_ns=stamp, log_ns=stamp)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Put a file into the log: the station, the experiment."""
@@ -162,7 +162,25 @@ class LogWriter:
         self._newest[topic] = sequence
         if sequence > last + 1:  # a smaller one begins a new count: the world was reset
             self.gaps[topic] = self.gaps.get(topic, 0) + sequence - last - 1
+        if sample.status != self._statuses.get(topic, 0):  # it travels beside the message, and would be lost
+            self._statuses[topic] = sample.status
+            self._note_status(StatusRecord(max(sample.capture_ns, 0), topic, sequence, sample.status), log_ns)
         self._put(None, topic, sample.payload, sequence, sample.capture_ns, log_ns)
+
+    def _note_status(self, record: StatusRecord, log_ns: int) -> None:
+        topic, type_name = STREAMS[StatusRecord]
+        self._types.setdefault(topic, type_name)
+        try:
+            payload = encode_record(record)
+        except ProtocolError:  # a status or a stamp that no message has room for: what cannot be told is left out
+            return
+        self._put(None, topic, payload, self._next(topic), record.capture_ns, log_ns)
+
+    def _next(self, topic: str) -> int:
+        """The next sequence number of a topic that is written here."""
+        with self._lock:
+            number = self._newest[topic] = self._newest.get(topic, -1) + 1
+        return number
 
     def _put(self, job: Job | None, topic: str, payload: bytes, sequence: int, publish_ns: int, log_ns: int) -> bool:
         with self._lock:

@@ -14,9 +14,11 @@ from drivers.wire import log_records, messages
 from drivers.wire.codec import TYPES, Reading, decode_reading
 from drivers.wire.log_records import MAGIC, Broken
 from drivers.wire.records import STREAMS, Record, decode_record
+from mechanics.records import StatusRecord
 
 _READINGS = {*TYPES.values(), messages.COMPRESSED_IMAGE}
 _RECORDS = {type_name for _, type_name in STREAMS.values()}
+_STATUS = STREAMS[StatusRecord]
 
 
 class Logged(NamedTuple):
@@ -28,12 +30,13 @@ class Logged(NamedTuple):
     sequence: int
     publish_ns: int
     log_ns: int
+    status: int = 0
 
     def value(self) -> Reading | Record:
         """The reading or record in it. Raises ProtocolError for other types and for garbage."""
         if self.type_name in _RECORDS:
             return decode_record(self.type_name, self.payload)
-        return decode_reading(self.type_name, self.payload, self.sequence, receive_ns=self.log_ns)
+        return decode_reading(self.type_name, self.payload, self.sequence, self.status, self.log_ns)
 
 
 class Break(NamedTuple):
@@ -71,9 +74,12 @@ class LogReader:
         """Messages in the order of the file, of all topics or those given."""
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
+        statuses: dict[str, int] = {}
         for record in self.records():
             if isinstance(record, Message):
                 channel = channels.get(record.channel_id)
+                if channel is not None and channel.topic == _STATUS[0]:
+                    _note(record.data, statuses)
                 if channel is None or (topics is not None and channel.topic not in topics):
                     continue
                 schema = schemas.get(channel.schema_id)
@@ -84,6 +90,7 @@ class LogReader:
                     record.sequence,
                     record.publish_time,
                     record.log_time,
+                    statuses.get(channel.topic, 0),
                 )
             elif isinstance(record, Channel):
                 channels[record.id] = record
@@ -154,3 +161,13 @@ class LogReader:
                 yield from log_records.definitions(file, size)
         self.breaks.append(Break(broken.at, size if following is None else following, broken.why))
         return following
+
+
+def _note(payload: bytes, statuses: dict[str, int]) -> None:
+    """Take in which status the readings of a stream have from here on."""
+    try:
+        record = decode_record(_STATUS[1], payload)
+    except ProtocolError:
+        return
+    if isinstance(record, StatusRecord):
+        statuses[record.stream] = record.status

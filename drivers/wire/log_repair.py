@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import filecmp
 import os
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from drivers.wire.log_reader import Break, LogReader
 MENDED = ".repaired"
 """Stands before the ending of a mended log's name: ``log.mcap`` is mended as ``log.repaired.mcap``."""
 
+_LOG = re.compile(rf"log(?:\.([0-9]{{1,9}}))?(?:{re.escape(MENDED)})?\.mcap")
 _CHUNK = 2**20
 
 
@@ -44,6 +46,20 @@ class Account:
 def mended_path(log: Path) -> Path:
     """Where the mended form of a log lies."""
     return log.with_name(f"{log.stem}{MENDED}{log.suffix}")
+
+
+def written_logs(folder: Path) -> list[Path]:
+    """The logs of a run folder as runs wrote them, in order: ``log.mcap``, then ``log.1.mcap`` … where it went on.
+
+    One of which only the mended form is left is among them.
+    """
+    found = {int(match[1] or 0) for file in folder.glob("log*.mcap") if (match := _LOG.fullmatch(file.name))}
+    return [folder / (f"log.{number}.mcap" if number else "log.mcap") for number in sorted(found)]
+
+
+def to_read(log: Path) -> Path:
+    """A log in its mended form, where there is one."""
+    return mended if (mended := mended_path(log)).is_file() else log
 
 
 def repair_log(log: Path) -> Account:

@@ -8,15 +8,26 @@ import numpy as np
 
 from drivers.errors import ProtocolError
 from drivers.wire import messages
-from mechanics.records import ContactBelief, EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
+from mechanics.records import (
+    ContactBelief,
+    EventRecord,
+    LookRecord,
+    PhaseRecord,
+    PlanarState,
+    StatusRecord,
+    TrialRecord,
+    WaypointRecord,
+)
 
-Record = WaypointRecord | TrialRecord | PhaseRecord | EventRecord
+Record = WaypointRecord | TrialRecord | PhaseRecord | EventRecord | LookRecord | StatusRecord
 
 STREAMS: dict[type, tuple[str, str]] = {
     WaypointRecord: ("run/waypoint", "extrinsic_msgs/msg/WaypointRecord"),
     TrialRecord: ("run/trial", "extrinsic_msgs/msg/TrialRecord"),
     PhaseRecord: ("run/phase", "extrinsic_msgs/msg/PhaseRecord"),
     EventRecord: ("run/event", "extrinsic_msgs/msg/EventRecord"),
+    LookRecord: ("run/look", "extrinsic_msgs/msg/LookRecord"),
+    StatusRecord: ("run/status", "extrinsic_msgs/msg/StatusRecord"),
 }
 """Topic and type of each kind of record."""
 
@@ -44,6 +55,15 @@ def encode_record(record: Record) -> bytes:
             "has_contact": record.contact is not None,
             "contact": _contact(record.contact or _NOWHERE),
         }
+    elif isinstance(record, LookRecord):
+        fields = {
+            "trial": record.trial,
+            "act": record.act,
+            "told": record.told,
+            "sources": list(record.sources),
+            "stamps": np.array(record.stamps, np.int64),
+            "sequences": np.array(record.sequences, np.int64),
+        }
     else:
         fields = {name: getattr(record, name) for name in record.__dataclass_fields__ if name != "capture_ns"}
     return messages.encode(messages.message(STREAMS[type(record)][1], header=header, **fields))
@@ -69,6 +89,8 @@ def decode_record(type_name: str, payload: bytes) -> Record:
             _planar(value.estimated) if value.has_estimate else None,
             _belief(value.contact) if value.has_contact else None,
         )
+    if kind is LookRecord:
+        return _look(capture_ns, value)
     names = [name for name in kind.__dataclass_fields__ if name != "capture_ns"]
     return kind(capture_ns, *(getattr(value, name) for name in names))
 
@@ -110,6 +132,14 @@ def _belief(value: Any) -> ContactBelief:
         got = f"{len(value.x)} x, {len(value.y)} y and {len(value.weights)} weights"
         raise ProtocolError("wire", "read where a contact was believed", got, "Expected one of each for every place")
     return ContactBelief(value.status, np.stack([value.x, value.y], axis=-1), value.weights.copy())
+
+
+def _look(capture_ns: int, value: Any) -> LookRecord:
+    if not len(value.sources) == len(value.stamps) == len(value.sequences):
+        got = f"{len(value.sources)} sources, {len(value.stamps)} stamps and {len(value.sequences)} sequence numbers"
+        raise ProtocolError("wire", "read what a look went by", got, "Expected one of each for every reading")
+    numbers = tuple(value.stamps.tolist()), tuple(value.sequences.tolist())
+    return LookRecord(capture_ns, value.trial, value.act, value.told, tuple(value.sources), *numbers)
 
 
 def _doubles(values: Any) -> Any:

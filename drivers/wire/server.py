@@ -24,6 +24,7 @@ from drivers.errors import (
     SimulationDiverged,
 )
 from drivers.interfaces import Device, ForceTorqueSensor, Gripper, ImagingSensor, Sensor, TactileSensor, TagCamera
+from drivers.streaming import StreamingSensor
 from drivers.wire import messages, topics
 from drivers.wire.bus import Bus, Query
 from drivers.wire.codec import Reading, encode_compressed, encode_reading
@@ -219,6 +220,8 @@ class DeviceServer:
             self._streams[stream] = self.desk.publisher(device.name, stream, type_name)
         if isinstance(device, Sensor):
             self._stops.append(device.listen(self._publish, self._publish_ruins))
+        if isinstance(device, StreamingSensor):
+            device.wanted = self._taken
         self._serve("describe", lambda _: Answer(json.dumps(asdict(self.device.describe()))), direct=True)
         self._verbs()
         self._withdraw = self.desk.bus.token(topics.alive(self.desk.station, device.name))
@@ -230,10 +233,12 @@ class DeviceServer:
             stop()
         self._withdraw()
         self._withdraw = lambda: None
+        self.device.close()  # before its streams: a device with a thread of its own looks who takes them
+        if isinstance(self.device, StreamingSensor):
+            self.device.wanted = lambda: True
         for publisher in self._streams.values():
             publisher.close()
         self._streams = {}
-        self.device.close()
 
     def _serve(self, verb: str, work: Verb, *, urgent: bool = False, direct: bool = False) -> None:
         self._stops.append(self.desk.serve(self.device.name, verb, work, urgent=urgent, direct=direct))
@@ -250,32 +255,36 @@ class DeviceServer:
         if isinstance(device, TagCamera):
             self._serve("image", lambda _: _picture(device.image()))
         if isinstance(device, TactileSensor):
-            self._serve("reference", lambda _: _reference(device))
+            self._serve("reference", lambda _: self._reference(device))
 
     def capture_if_wanted(self) -> None:
         """Take a frame if somebody listens: the stream of a camera that has no thread of its own.
 
         A frame that does not come is missing from the stream, where its readers notice.
         """
-        if any(publisher.matched for publisher in self._streams.values()):
+        if self._taken():
             with contextlib.suppress(DriverError):
                 self.capture()
+
+    def _taken(self) -> bool:
+        """Whether anybody takes the device's readings now."""
+        return any(publisher.matched for stream, publisher in self._streams.items() if stream != "reference")
 
     def capture(self) -> int:
         """Take a frame; its reading and its picture go out as streams. Returns its sequence number."""
         device = self.device
         assert isinstance(device, ImagingSensor)
         reading = device.capture()
-        if isinstance(device, TagCamera) and self._streams["image"].matched:
-            picture = device.image()
-            if picture is not None:
-                self._put_picture(picture)
+        if not isinstance(device, StreamingSensor):
+            self._put_picture_of(device)
         return reading.stamp.sequence
 
     def _publish(self, reading: Reading) -> None:
         if isinstance(reading, ImageReading):
             self._put_picture(reading)
             return
+        if isinstance(self.device, StreamingSensor):  # a camera that sends by itself
+            self._put_picture_of(self.device)
         publisher = next(iter(self._streams.values()), None)
         if publisher is not None and publisher.matched:
             shift, stamp = self.desk.shift_ns(), reading.stamp
@@ -287,6 +296,13 @@ class DeviceServer:
         if publisher is not None and publisher.matched:
             publisher.put(_RUINS, stamp.sequence, stamp.capture_ns + self.desk.shift_ns(), int(stamp.status))
 
+    def _put_picture_of(self, device: Device) -> None:
+        """The picture behind a tag camera's newest reading."""
+        if isinstance(device, TagCamera) and self._streams["image"].matched:
+            picture = device.image()
+            if picture is not None:
+                self._put_picture(picture)
+
     def _put_picture(self, picture: ImageReading) -> None:
         publisher = self._streams["image"]
         if publisher.matched:
@@ -294,14 +310,16 @@ class DeviceServer:
             encode = encode_reading if publisher.type_name == messages.IMAGE else encode_compressed
             publisher.put(encode(picture, shift), stamp.sequence, stamp.capture_ns + shift, int(stamp.status))
 
-
-def _reference(device: TactileSensor) -> Answer:
-    picture = device.reference()
-    encoding = "bgr8" if picture.ndim == 3 else "16UC1" if picture.dtype == np.uint16 else "mono8"
-    return Answer(
-        type=messages.IMAGE,
-        data=encode_reading(ImageReading(Stamp(0, 0, 0, device.describe().frame), picture, encoding)),
-    )
+    def _reference(self, device: TactileSensor) -> Answer:
+        """The picture of the untouched finger: for who asks, and as a stream, so that the log has it."""
+        picture, now_ns = device.reference(), self.desk.now_ns()
+        encoding = "bgr8" if picture.ndim == 3 else "16UC1" if picture.dtype == np.uint16 else "mono8"
+        stamp = Stamp(now_ns, now_ns, 0, device.describe().frame)
+        data = encode_reading(ImageReading(stamp, picture, encoding))
+        stream = self._streams["reference"]
+        if stream.matched:
+            stream.put(data, stream.newest + 1, now_ns)
+        return Answer(type=messages.IMAGE, data=data)
 
 
 def _picture(picture: ImageReading | None) -> Answer | None:

@@ -43,12 +43,15 @@ _SUITABLE: dict[Role, tuple[Role, ...]] = {
 log = logging.getLogger(__name__)
 
 
-def station_bus(config: StationConfig, role: Role, *, at_once: bool = False) -> Bus:
+def station_bus(
+    config: StationConfig, role: Role, *, at_once: bool = False, routing: bool = False, joining: bool = False
+) -> Bus:
     """Join a station's bus. A ``device`` listens where there is no router; everybody else connects.
 
-    Raises NotConnected, and InputError where listening would let strangers in.
+    Where several processes of one machine serve a station without a router, one of them is ``routing``, and the others
+    are ``joining`` it. Raises NotConnected, and InputError where listening would let strangers in.
     """
-    bus, listen = config.bus, role == "device" and config.bus.mode == "peer"
+    bus, listen = config.bus, role == "device" and config.bus.mode == "peer" and not joining
     if listen:
         refuse_open_door(config)
     identity = None if bus.tls is None else find_identity(bus.tls, role)
@@ -57,7 +60,7 @@ def station_bus(config: StationConfig, role: Role, *, at_once: bool = False) -> 
     return Bus(
         bus.endpoint,
         listen=listen,
-        mode=bus.mode,
+        mode="router" if routing else "client" if joining else bus.mode,
         timeout=bus.timeout,
         shared_memory=False,
         lease=config.lease,

@@ -20,13 +20,14 @@ STREAMS: dict[str, dict[str, str]] = {
     "gripper": {"state": messages.GRIPPER},
     "force_torque": {"wrench": messages.WRENCH},
     "tag_camera": {"detections": messages.DETECTIONS, "image": messages.COMPRESSED_IMAGE},
-    "tactile": {"image": messages.COMPRESSED_IMAGE},
-    "tactile/soft_bubble": {"image": messages.IMAGE},
+    "tactile": {"image": messages.COMPRESSED_IMAGE, "reference": messages.IMAGE},
+    "tactile/soft_bubble": {"image": messages.IMAGE, "reference": messages.IMAGE},
     WORLD: {"truth": messages.TRUTH},
 }
 """Streams by kind of device, with their types; the first carries the device's readings.
 
-A tactile finger that measures depth sends it as it is, so that every ROS viewer draws it; colour is compressed.
+A tactile finger that measures depth sends it as it is, so that every ROS viewer draws it; colour is compressed. The
+picture of the untouched finger, without loss, is published each time that somebody asks for it.
 """
 
 

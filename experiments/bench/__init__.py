@@ -25,8 +25,8 @@ FILE_WIDTH = 160
 class Options:
     """What a benchmark is asked for; None where it has a usual figure of its own, or no such option.
 
-    ``runs``: measurements per figure. ``horizons``: steps of the problems of `planning`. ``minutes`` and ``viewers``
-    are of `load`.
+    ``runs``: measurements per figure. ``horizons``: steps of the problems of `planning`. ``minutes`` are of `load` and
+    `bus`, ``viewers`` of `load`.
     """
 
     runs: int | None = None
@@ -60,6 +60,12 @@ def _load(options: Options) -> Iterator[figures.Figure]:
     return load.run(options.minutes or load.MINUTES, viewers)
 
 
+def _bus(options: Options) -> Iterator[figures.Figure]:
+    from experiments.bench import bus
+
+    return bus.run(bus.SECONDS if options.minutes is None else 60.0 * options.minutes)
+
+
 def _side_by_side(measured: Sequence[figures.Figure]) -> Table:
     from experiments.bench import planning_table
 
@@ -71,12 +77,13 @@ BENCHMARKS: dict[str, Callable[[Options], Iterator[figures.Figure]]] = {
     "estimation": _estimation,
     "planning": _planning,
     "load": _load,
+    "bus": _bus,
 }
 #: which benchmarks have an option
 HAVE: dict[str, tuple[str, ...]] = {
     "runs": ("sim", "estimation", "planning"),
     "horizons": ("planning",),
-    "minutes": ("load",),
+    "minutes": ("load", "bus"),
     "viewers": ("load",),
 }
 #: measurements per figure

@@ -62,6 +62,7 @@ class Targets(BaseModel):
     estimation: dict[str, Target]
     planning: dict[str, Target]
     load: dict[str, Target] = {}
+    bus: dict[str, Target] = {}
     tables: dict[str, dict[str, Target]] = {}
 
 

@@ -1,14 +1,15 @@
 """The backends that the device contract is held against, and the table of how they fared.
 
-A backend is one entry of `BACKENDS`: a context manager that takes a station and yields a `Lab` whose devices are open.
+A backend is one entry of `BACKENDS`: a context manager that yields a `Lab` whose devices are open. A claim is held
+against every backend, or against those that it names: ``@pytest.mark.backends(*SIMULATED)``.
 """
 
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from functools import partial
 from typing import cast
 
 import pytest
@@ -23,11 +24,12 @@ from drivers.config import (
     TagCameraConfig,
     WorldConfig,
 )
-from drivers.interfaces import Arm, Clock, Device, Simulation
 from drivers.scene import Body, Scene, TagMount
 from drivers.sim.soft_bubble import view_of
 from drivers.sim.world import World
 from drivers.station import Station
+from tests.conformance import emulated
+from tests.conformance.lab import Lab, losing_readings, losing_samples
 
 START = (0.0, 0.25, 0.1)
 
@@ -45,21 +47,6 @@ SCENE = Scene(
 ).model_dump(mode="json")
 
 
-@dataclass
-class Lab:
-    """An open station as its user sees it.
-
-    ``join`` opens it a second time, for another client; ``losing`` is a context in which what a device sends does not
-    arrive.
-    """
-
-    devices: Mapping[str, Device]
-    clock: Clock
-    simulation: Simulation
-    join: Callable[[], AbstractContextManager[Lab]]
-    losing: Callable[[Device], AbstractContextManager[None]]
-
-
 @contextmanager
 def in_process(config: StationConfig) -> Iterator[Lab]:
     """The simulated devices themselves; a second client shares them."""
@@ -69,13 +56,7 @@ def in_process(config: StationConfig) -> Iterator[Lab]:
     def join() -> Iterator[Lab]:
         yield lab
 
-    @contextmanager
-    def losing(device) -> Iterator[None]:
-        device._push = lambda reading: None
-        yield
-        del device._push
-
-    lab = Lab(world.devices, world, world, join, losing)
+    lab = Lab(world.devices, world, world, join, losing_readings)
     for device in world.devices.values():
         device.connect()
     yield lab
@@ -86,35 +67,20 @@ def in_process(config: StationConfig) -> Iterator[Lab]:
 @contextmanager
 def over_zenoh(config: StationConfig) -> Iterator[Lab]:
     """The simulated devices in a host process, over the bus; a second client is a second session."""
-
-    @contextmanager
-    def losing(device) -> Iterator[None]:
-        # the subscription goes on, since a stream that nobody subscribes to is not produced
-        subscription = device._subscription
-        handlers, subscription._handlers = subscription._handlers, ()
-        yield
-        subscription._handlers = handlers
-
     with Station(config).connect() as devices:
         assert devices.simulation is not None
-        yield Lab(devices, devices.clock, devices.simulation, lambda: over_zenoh(config), losing)
+        yield Lab(devices, devices.clock, devices.simulation, lambda: over_zenoh(config), losing_samples)
 
 
-BACKENDS: dict[str, Callable[[StationConfig], AbstractContextManager[Lab]]] = {
+SIMULATED: dict[str, Callable[[StationConfig], AbstractContextManager[Lab]]] = {
     "sim in process": in_process,
     "sim over zenoh": over_zenoh,
 }
 
 
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
-@pytest.fixture(scope="module", params=list(BACKENDS))
-def opened(request: pytest.FixtureRequest) -> Iterator[Lab]:
-    """The backend's station, open for the whole module."""
+@contextmanager
+def simulated(open_station: Callable[[StationConfig], AbstractContextManager[Lab]]) -> Iterator[Lab]:
+    """A simulated station with a device of every kind."""
     config = StationConfig(
         name="bench",
         world=WorldConfig(),
@@ -133,27 +99,53 @@ def opened(request: pytest.FixtureRequest) -> Iterator[Lab]:
     bubble = config.devices["bubble"]
     assert isinstance(bubble, TactileConfig)
     view_of(bubble)  # compiled once per installation, which takes longer than a frame may
-    with BACKENDS[request.param](config) as lab:
+    with open_station(config) as lab:
+        yield lab
+
+
+BACKENDS: dict[str, Callable[[], AbstractContextManager[Lab]]] = {
+    **{name: partial(simulated, opened) for name, opened in SIMULATED.items()},
+    "real": emulated.in_process,
+    "real over zenoh": emulated.over_zenoh,
+}
+
+
+def free_endpoint() -> str:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "opened" in metafunc.fixturenames:
+        mark = metafunc.definition.get_closest_marker("backends")
+        metafunc.parametrize("opened", list(BACKENDS if mark is None else mark.args), indirect=True, scope="module")
+
+
+@pytest.fixture(scope="module")
+def opened(request: pytest.FixtureRequest) -> Iterator[Lab]:
+    """The backend's station, open for the whole module."""
+    with BACKENDS[request.param]() as lab:
         yield lab
 
 
 @pytest.fixture
 def lab(opened: Lab) -> Lab:
-    """The station as new: every device open, the arm free, the world at its start."""
+    """The station as new: every device open, the arm free, a world at its start."""
     for device in opened.devices.values():
         device.connect()
-    arm = opened.devices["arm"]
-    assert isinstance(arm, Arm)
+    arm = opened.of("arm")
     arm.release()
     arm.recover()
-    opened.simulation.reset(0, SCENE)
+    if opened.simulation is not None:
+        opened.simulation.reset(0, SCENE)
     return opened
 
 
-@pytest.fixture(params=list(BACKENDS))
+@pytest.fixture(params=list(SIMULATED))
 def backend(request: pytest.FixtureRequest) -> Callable[[StationConfig], AbstractContextManager[Lab]]:
-    """The way to open a station of one's own, to be broken."""
-    return BACKENDS[request.param]
+    """The way to open a simulated station of one's own, to be broken."""
+    return SIMULATED[request.param]
 
 
 @pytest.fixture

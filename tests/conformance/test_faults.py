@@ -23,6 +23,8 @@ from .fault_cases import (
     wait_until_gone,
 )
 
+pytestmark = pytest.mark.backends("sim in process", "sim over zenoh")
+
 
 @pytest.fixture(autouse=True)
 def mended(request):

@@ -118,6 +118,39 @@ def test_a_slower_pace_stretches_every_motion_along_the_same_path(arm, clock):
     assert clock.slept == pytest.approx(1.2)
 
 
+class WallClock(Clock):
+    """Time that passes by itself, too: while a set-point is on its way."""
+
+    lockstep = False
+
+
+class SlowArm(Arm):
+    def __init__(self, clock, takes):
+        super().__init__()
+        self.clock, self.takes, self.at = clock, takes, []
+
+    def command(self, target):
+        self.at.append(self.clock.slept)
+        self.clock.slept += self.takes.pop(0) if self.takes else 0.004
+        super().command(target)
+
+
+def test_in_real_time_what_a_set_point_takes_does_not_slow_the_motion_down():
+    clock = WallClock()
+    arm = SlowArm(clock, [])
+    mover(arm, clock).ramp(np.array([0.01, 0.0, 0.0]), 1.0)
+    assert len(arm.targets) == 50
+    assert arm.at[-1] - arm.at[0] == pytest.approx(49 * 0.02, abs=0.005)
+
+
+def test_in_real_time_a_long_delay_is_not_made_up_for():
+    clock = WallClock()
+    arm = SlowArm(clock, [0.004, 0.004, 0.3])
+    mover(arm, clock).ramp(np.array([0.01, 0.0, 0.0]), 0.2)
+    after = np.diff(arm.at)[3:]
+    assert (after >= 0.02 - 1e-9).all()
+
+
 def test_going_above_sweeps_nothing_off_the_table(arm, clock):
     mover(arm, clock, (0.0, 0.1, 0.0)).go_above(np.array([0.02, 0.05, 0.1]))
     poses = np.array([target.pose for target in arm.targets])

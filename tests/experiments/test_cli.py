@@ -4,7 +4,7 @@ import signal
 
 import pytest
 
-COMMANDS = ("run", "check", "serve", "status", "report")
+COMMANDS = ("run", "check", "serve", "status", "report", "replay")
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.config import TagCameraConfig
 from drivers.scene import Body
 from experiments.calibrate.store import Calibrations
 from experiments.check import check, tasks
@@ -88,7 +89,7 @@ def test_figures_are_si_and_in_the_objects_frame():
 
 def test_the_camera_sees_the_table_tags_and_the_whole_grasped_object():
     station = load("grasped_static").station
-    camera = next(d for d in station.devices.values() if d.kind == "tag_camera")
+    camera = next(d for d in station.devices.values() if isinstance(d, TagCameraConfig))
     model = CameraModel.looking_at(camera.position, camera.look_at, camera.focal, camera.width, camera.height)
     seen = [
         (mount.pose[0] + sx * mount.size * 0.625, -mount.height, mount.pose[1] + sy * mount.size * 0.625)

@@ -23,7 +23,8 @@ from pydantic import BaseModel
 
 import experiments
 from drivers.config import StationConfig
-from drivers.errors import DriverError, ProtocolError
+from drivers.errors import DriverError, NotConnected, ProtocolError
+from drivers.real.netft_setup import HttpError, SetupError
 from drivers.sim.mismatch import FOLDER as PROFILES
 from drivers.sim.mismatch import Mismatch
 from drivers.wire import messages
@@ -61,7 +62,7 @@ from mechanics.yaml_input import InputError, parse, read_yaml
 from planning import plan_file
 from planning.plan import Plan
 from planning.plan_file import PlanFileError
-from tests.fuzz import on_the_bus
+from tests.fuzz import franka, mjpeg, netft, on_the_bus
 
 PACKAGE = Path(experiments.__file__).parent
 
@@ -383,6 +384,12 @@ DECODERS: dict[str, Decoder] = {
     "reading": Decoder(on_the_bus.readings, on_the_bus.take_reading, (ProtocolError,)),
     "record": Decoder(on_the_bus.records, on_the_bus.take_record, (ProtocolError,)),
     "message": Decoder(on_the_bus.others, on_the_bus.take_other, (ProtocolError,)),
+    "rdt": Decoder(netft.datagrams, netft.take_datagrams, ()),
+    "rdt_setup": Decoder(netft.setups, netft.take_setup, (SetupError,), netft.WORDS),
+    "rdt_page": Decoder(netft.pages, netft.take_page, (HttpError, SetupError), netft.WORDS),
+    "urdf": Decoder(franka.models, franka.take_model, (ProtocolError,), franka.WORDS),
+    "mjpeg": Decoder(mjpeg.answers, mjpeg.take_answer, (ProtocolError, NotConnected), mjpeg.WORDS),
+    "jpeg": Decoder(mjpeg.pictures, mjpeg.take_picture, (ProtocolError,), mjpeg.WORDS),
     "yaml": Decoder(_yaml_seeds, _decode_yaml, (InputError,), _WORDS),
     "model": Decoder(_models, _decode_model, (InputError,), _WORDS),
     "experiment": Decoder(_experiments, _decode_experiment, (InputError,), _WORDS),

@@ -25,7 +25,16 @@ from mechanics.readings import (
     TruthReading,
     WrenchReading,
 )
-from mechanics.records import ContactBelief, EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
+from mechanics.records import (
+    ContactBelief,
+    EventRecord,
+    LookRecord,
+    PhaseRecord,
+    PlanarState,
+    StatusRecord,
+    TrialRecord,
+    WaypointRecord,
+)
 from planning.plan import Plan
 
 STAMP = Stamp(1_500_000_000, 1_500_000_000, 7, "world")
@@ -101,6 +110,8 @@ def records() -> list[bytes]:
         TrialRecord(5, "t", "grasped_static", "open_loop", "completed", "", json.dumps(plan().to_dict())),
         PhaseRecord(5, "t", "preload"),
         EventRecord(5, "warning", "gripper slipped"),
+        LookRecord(5, "t", "see", "{}", ("arm", "camera"), (4, 5), (1, 2)),
+        StatusRecord(5, "lab/wrist/wrench", 7, 2),
     ]
     return [bytes([RECORD_TYPES.index(STREAMS[type(r)][1])]) + encode_record(r) for r in records]
 

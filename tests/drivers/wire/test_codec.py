@@ -11,7 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from drivers.errors import ProtocolError
 from drivers.wire import codec, messages
 from drivers.wire.codec import TYPES, Reading, decode_reading, encode_reading
-from drivers.wire.records import STREAMS, decode_record, encode_record
+from drivers.wire.records import STREAMS, Record, decode_record, encode_record
 from mechanics.readings import (
     ContactTruth,
     GripperReading,
@@ -24,7 +24,16 @@ from mechanics.readings import (
     TruthReading,
     WrenchReading,
 )
-from mechanics.records import ContactBelief, EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
+from mechanics.records import (
+    ContactBelief,
+    EventRecord,
+    LookRecord,
+    PhaseRecord,
+    PlanarState,
+    StatusRecord,
+    TrialRecord,
+    WaypointRecord,
+)
 from mechanics.task_plane import TaskPlane
 
 STOCK = get_typestore(Stores.ROS2_HUMBLE)
@@ -57,6 +66,7 @@ detections = st.builds(
     vectors(8).map(lambda v: v.reshape(4, 2)),
     st.integers(0, 2),
     st.floats(0, 255, width=32),
+    st.none() | st.integers(0, 2**20).map(lambda n: n / 2**20),  # it travels in 32 bits
 )
 tags = st.builds(TagReading, stamps(), st.lists(detections, max_size=4).map(tuple))
 contacts = st.builds(
@@ -208,6 +218,18 @@ def test_a_camera_picture_survives_compression_within_a_few_grey_levels() -> Non
     assert np.abs(back.image.astype(int) - ramp).max() <= 4
 
 
+@pytest.mark.parametrize("goodness", [0.0, math.nan, -1.0, 1.5, math.inf])
+def test_a_goodness_that_is_none_of_ours_tells_no_ambiguity(goodness: float) -> None:
+    value = messages.decode(
+        encode_reading(TagReading(Stamp(0, 0, 0, "camera"), (TagDetection(3, np.eye(4, 2), 0, 50.0, 0.5),))),
+        messages.DETECTIONS,
+    )
+    assert value.detections[0].goodness == 0.5
+    value.detections[0].goodness = goodness
+    read = decode_reading(messages.DETECTIONS, messages.encode(value), 0)
+    assert isinstance(read, TagReading) and read.detections[0].ambiguity is None
+
+
 def test_a_tags_homography_takes_its_square_to_its_corners() -> None:
     corners = np.array([[10.0, 90.0], [95.0, 85.0], [80.0, 12.0], [15.0, 8.0]])
     reading = TagReading(Stamp(0, 0, 0, "camera"), (TagDetection(3, corners, 0, 50.0),))
@@ -226,6 +248,7 @@ beliefs = st.integers(0, 4).flatmap(
         ContactBelief, names, vectors(2 * count).map(lambda values: values.astype(float).reshape(-1, 2)), vectors(count)
     )
 )
+whole_numbers = st.integers(-(2**63), 2**63 - 1)
 records = st.one_of(
     st.builds(
         WaypointRecord,
@@ -242,12 +265,18 @@ records = st.one_of(
     st.builds(TrialRecord, captures, names, names, names, names, names, names),
     st.builds(PhaseRecord, captures, names, names),
     st.builds(EventRecord, captures, names, names),
+    st.lists(st.tuples(names, whole_numbers, whole_numbers), max_size=4).flatmap(
+        lambda reads: st.builds(
+            LookRecord, captures, names, names, names, *(st.just(tuple(read[i] for read in reads)) for i in range(3))
+        )
+    ),
+    st.builds(StatusRecord, captures, names, whole_numbers, st.sampled_from([int(status) for status in Status])),
 )
 
 
 @given(records)
 def test_a_record_comes_back_as_it_was_written(
-    record: WaypointRecord | TrialRecord | PhaseRecord | EventRecord,
+    record: Record,
 ) -> None:
     assert same(decode_record(STREAMS[type(record)][1], encode_record(record)), record)
 

@@ -88,4 +88,5 @@ def test_log_knows_the_type_of_a_fingers_stream(sensor: str, form: str) -> None:
     config = StationConfig.model_validate(
         {"name": "lab", "devices": {"finger": {"kind": "tactile", "sensor": sensor, "finger": "left"}}}
     )
-    assert topics.streams(config) == {"lab/finger/image": form}
+    # the untouched picture without loss, whatever the finger measures
+    assert topics.streams(config) == {"lab/finger/image": form, "lab/finger/reference": messages.IMAGE}

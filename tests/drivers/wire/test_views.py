@@ -86,7 +86,7 @@ def test_a_view_lies_beside_its_stream_and_is_none_itself() -> None:
         {"name": "lab", "devices": {"finger": {"kind": "tactile", "sensor": "gelslim", "finger": "left"}}}
     )
     # what a log and a runner subscribe to, and what a replay publishes
-    assert list(topics.streams(config)) == ["lab/finger/image"]
+    assert list(topics.streams(config)) == ["lab/finger/image", "lab/finger/reference"]
 
 
 def test_nothing_is_produced_while_nobody_looks(served: Bus, joined: Bus, by_hand: Time) -> None:
@@ -301,6 +301,7 @@ def test_every_device_has_views_of_readings_and_pictures_at_their_rates(served: 
             "lab/arm/safety/view": 50.0,
             "lab/wrist_ft/wrench/view": 50.0,
             "lab/finger/image/view": 4.0,
+            "lab/finger/reference/view": 4.0,
         }
         got = looked_at(a._streams["pose"], joined, "lab/arm/pose/view")
         a._streams["pose"].view._next = 0.0  # type: ignore[union-attr]

@@ -1,0 +1,72 @@
+"""An open station as the device contract sees it, whatever its devices are."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from drivers.interfaces import Clock, Device, Simulation
+
+#: name in the simulated station of one device per kind
+SIM_NAMES = {
+    "arm": "arm",
+    "gripper": "gripper",
+    "force_torque": "wrist_ft",
+    "tag_camera": "camera",
+    "tactile": "bubble",
+}
+
+
+@dataclass
+class Lab:
+    """An open station as its user sees it.
+
+    ``names`` are its devices by kind. ``join`` opens it a second time, for another client; ``losing`` is a context in
+    which what a device sends does not arrive. ``accuracy`` (3,) [m, m, rad] is how well its arm reaches a set-point.
+    Without a ``simulation`` the devices are real ones, at emulators, or a recording; time passes by itself.
+    """
+
+    devices: Mapping[str, Device]
+    clock: Clock
+    simulation: Simulation | None
+    join: Callable[[], AbstractContextManager[Lab]]
+    losing: Callable[[Device], AbstractContextManager[None]]
+    names: Mapping[str, str] = field(default_factory=lambda: SIM_NAMES)
+    accuracy: tuple[float, float, float] = (1e-6, 1e-6, 1e-6)
+    #: the time [s] that a device of a kind lives by: an emulated robot on a busy machine is slower than the wall
+    own_time: Callable[[str], float] = lambda _kind: time.monotonic()
+
+    def of(self, kind: str) -> Any:
+        """The device of a kind."""
+        return self.devices[self.names[kind]]
+
+    @property
+    def world(self) -> Simulation:
+        """The simulation of a backend that has one."""
+        assert self.simulation is not None
+        return self.simulation
+
+
+@contextmanager
+def losing_readings(device) -> Iterator[None]:
+    """What a device of this process gives out does not arrive."""
+    device._push = lambda reading: None
+    try:
+        yield
+    finally:
+        del device._push
+
+
+@contextmanager
+def losing_samples(device) -> Iterator[None]:
+    """What a device sends over the bus does not arrive."""
+    # the subscription goes on, since a stream that nobody subscribes to is not produced
+    subscription = device._subscription
+    handlers, subscription._handlers = subscription._handlers, ()
+    try:
+        yield
+    finally:
+        subscription._handlers = handlers
