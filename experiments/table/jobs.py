@@ -154,6 +154,9 @@ def run_jobs_of(table: Table, run: RunEntry, options: Options, folder: Path | No
         resolved, stages = _resolved(table, run, trajectory, sets, controllers)
         tags = _tags(run, trajectory, resolved)
         others = tuple(text for text in sets if not text.startswith("stages"))  # the stages are resolved
+        if run.plans_of is not None and resolved.experiment.grasp.centre_mm == "auto":
+            centre = _grasp_centre(table, run.plans_of, trajectory.name, options, folder)
+            others = (*others, f"grasp.centre_mm={json.dumps(centre)}")
         one = Asked(f"{run.name}-{trajectory.name}", run.experiment, run.station, others, tags, stages)
         if not controllers:
             jobs.append(one)
@@ -164,6 +167,17 @@ def run_jobs_of(table: Table, run: RunEntry, options: Options, folder: Path | No
             for number in list(numbers)[: options.trials]
         ]
     return jobs
+
+
+def _grasp_centre(
+    table: Table, name: str, trajectory: str, options: Options, folder: Path | None
+) -> tuple[float, float]:
+    """Where the object is held [mm] in the run whose plans are executed again: with other fingers, too."""
+    run = next(run for run in table.runs if run.name == name)
+    own = next((one.set for one in table.trajectories_of(run) if one.name == trajectory), {})
+    sets = _sets({**table.set, **run.set}, own, options.sets, options.seed, folder)
+    given = tuple(text for text in sets if not text.startswith("stages"))
+    return load(run.experiment, run.station, given).grasp_centre_mm
 
 
 def check_first(table: Table, runs: Sequence[RunEntry], options: Options) -> None:
