@@ -50,11 +50,11 @@ _EMPTY = 128
 #: a world that is late catches up, for the plant has to go the way that the robot went; later than this, it cannot [s]
 _LATEST = 2.0
 #: how finely it goes that way [ns], and how far behind the robot's newest pose without hurry [s]
-_PIECE_NS, _BACKLOG = 2_000_000, 0.02
+_PIECE_NS, _BACKLOG = 4_000_000, 0.03
 #: how long the picture of an untouched finger may take, which is the mean of many [s]
 _REFERENCE = 20.0
 #: how often the robot's pose leads the plant [Hz], and the planar pose of ee that it begins at
-_POSES, _HOME = 250.0, (0.0, 0.3, 0.0)
+_POSES, _HOME = 125.0, (0.0, 0.3, 0.0)
 
 
 class EmulatedLab(Host):
@@ -166,7 +166,9 @@ class EmulatedLab(Host):
         """The scene, with the arm where the robot is: nobody can put that one somewhere else."""
         if self._robot is None:
             return scene
-        x, y, angle = self._robot.pose()[1].tolist()
+        time, pose = self._robot.pose()
+        self._way = _Way(time, pose)  # what it went before is nothing to this scene
+        x, y, angle = pose.tolist()
         return scene.model_copy(update={"start": (x, y, angle)})
 
     def _step(self, span_ns: int) -> None:
