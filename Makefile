@@ -49,10 +49,7 @@ demo: setup  ## calibrate, plan, tip a pentagon over its corner and report, in a
 
 test: setup browser usb  ## the default test suite
 	@$(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -m 'not slow and not alone' tests/experiments tests  # the long ones first
-	@# in real time, beside an emulated robot: nothing else at a time; what failed runs once more, and has to pass then,
-	@# for on a machine that others share a second may be missing, and an emulated robot without it is late
-	@$(BIN)/python -m pytest -m 'alone and not slow' \
-	  || $(BIN)/python -m pytest -m 'alone and not slow' --last-failed --last-failed-no-failures none
+	@$(BIN)/python -m pytest -m 'alone and not slow'  # in real time, beside an emulated robot: nothing else at a time
 
 test-slow: setup browser usb  ## the long tests
 	@$(BIN)/python -m pytest -m slow --timeout=1800

@@ -53,19 +53,21 @@ class Mover:
 
     def _send(self, pose: Array, twist: Array) -> None:
         self._sequence += 1
+        sent_ns = self._clock.now_ns()
         self._arm.command(ArmTarget(pose, twist, self._period, self._sequence))
         self.pose = pose
-        self._clock.sleep(self._period if self._clock.lockstep else self._until_due())
+        self._clock.sleep(self._period if self._clock.lockstep else self._until_due(sent_ns))
         self._tick()
 
-    def _until_due(self) -> float:
+    def _until_due(self, sent_ns: int) -> float:
         """How long until the next set-point is due: what this one took is not to slow the motion down.
 
-        One that is late by more than a period is not made up for: the arm would hurry after it.
+        A set-point that was sent more than a period after it was due, late or as the first after a pause, begins the
+        time anew: the arm would hurry after it.
         """
-        now, period = self._clock.now_ns(), round(self._period * 1e9)
-        self._due_ns = max(self._due_ns, now - period) + period
-        return max(self._due_ns - now, 0) * 1e-9
+        period = round(self._period * 1e9)
+        self._due_ns = (self._due_ns if sent_ns - self._due_ns < period else sent_ns) + period
+        return max(self._due_ns - self._clock.now_ns(), 0) * 1e-9
 
     def _ticks(self, seconds: float) -> int:
         """Set-points of a motion that is meant to take ``seconds``."""

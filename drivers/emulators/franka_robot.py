@@ -222,7 +222,7 @@ def _run(simulation: Any, server: Any, robot: Any, forward: Any, pipe: Any, ever
         due += 1e-3
         left = due - time.monotonic()
         if left > 0:
-            time.sleep(left)
+            time.sleep(left)  # the robot's own thousand steps a second, by absolute deadlines
         elif left < -_BEHIND:
             due = time.monotonic()
 

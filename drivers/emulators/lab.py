@@ -60,11 +60,8 @@ _POSES, _HOME = 125.0, (0.0, 0.3, 0.0)
 class EmulatedLab(Host):
     """The world of an emulated lab, and its devices: emulated at one end of their protocols, real at the other."""
 
-    def __init__(self, config: StationConfig, bus: Bus, crash: Callable[[], None] | None = None):
-        if crash is None:
-            super().__init__(config, bus)
-        else:
-            super().__init__(config, bus, crash)
+    def __init__(self, config: StationConfig, bus: Bus):
+        super().__init__(config, bus)
         self._robot: FrankaArmEmulator | None = None
         self._way: _Way | None = None
         self._wrenches: dict[str, Sequence[float]] = {}

@@ -113,6 +113,7 @@ class DepthStream:
                 return None
             self._waiting = frame, self._pace.due(frame.number, frame.told_ns, time.monotonic())
         frame, due = self._waiting
+        # a recording has no event to wait for: its frames come when they were exposed, and `timeout` bounds the wait
         time.sleep(max(0.0, min(due, deadline) - time.monotonic()))
         if due > deadline:
             return None

@@ -117,7 +117,7 @@ class UsbSource(FrameSource):
             raise DeviceFault(
                 self.name, f"read {self.address}", "it gives no more frames", "See to its plug; it is tried again", True
             )
-        time.sleep(0.01)
+        time.sleep(0.01)  # a grab that fails returns at once, and tells nothing of when the next one may not
 
     def _picture(self, capture: Capture) -> Callable[[bool], NDArray[np.uint8]]:
         good, image = capture.retrieve()  # now: the next grab takes its place

@@ -137,7 +137,7 @@ class Recording:
             with self._turn:
                 self._advance(self._now + round(seconds * 1e9))
         else:
-            time.sleep(seconds)
+            time.sleep(seconds)  # station time, which here is everybody's
 
     def advance_to(self, t_ns: int) -> None:
         """Play on until recorded time ``t_ns``; nothing where that is past. In lockstep only."""

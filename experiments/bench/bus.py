@@ -167,7 +167,7 @@ def _idle() -> Iterator[Figure]:
 
 def _watched(name: str, pid: int) -> Figure:
     """What a process takes of the processor while nothing is asked of it."""
-    time.sleep(_SETTLE)
+    time.sleep(_SETTLE)  # nobody tells when a process has done with its beginning
     before, begin = _cpu(pid), time.monotonic()
     time.sleep(IDLE)  # the span of time that is measured
     return figure_of(name, [100 * (_cpu(pid) - before) / (time.monotonic() - begin)], "%", "nobody listens")

@@ -109,7 +109,7 @@ class Bench:
         values = list[Any]()
         stop = self.opened.device.listen(lambda reading: values.append(value(reading)))
         try:
-            time.sleep(max(seconds, 3.0 / self.config.rate))
+            time.sleep(max(seconds, 3.0 / self.config.rate))  # all of a span of time is asked for
         finally:
             stop()
         if not values:

@@ -8,7 +8,28 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+import pytest
+
 from drivers.interfaces import Clock, Device, Simulation
+
+SIMULATED = ("sim in process", "sim over zenoh")
+LIVE = (*SIMULATED, "real", "real over zenoh")
+
+#: what only a world that stands still between two calls can be held to
+in_lockstep = pytest.mark.backends(*SIMULATED)
+#: and what can be commanded
+live = pytest.mark.backends(*LIVE)
+
+
+def about(kind: str) -> Callable:
+    """Mark a claim as one about a kind, for the table."""
+
+    def mark(test):
+        test.kind = kind
+        return test
+
+    return mark
+
 
 #: name in the simulated station of one device per kind
 SIM_NAMES = {

@@ -143,6 +143,18 @@ def test_in_real_time_what_a_set_point_takes_does_not_slow_the_motion_down():
     assert arm.at[-1] - arm.at[0] == pytest.approx(49 * 0.02, abs=0.005)
 
 
+def test_in_real_time_each_set_point_has_its_period_after_a_pause_too():
+    clock = WallClock()
+    arm = SlowArm(clock, [])
+    moving = mover(arm, clock)
+    for _ in range(2):
+        clock.slept += 1.0  # somebody plans
+        moving.ramp(np.array([0.01, 0.0, 0.0]), 0.2)
+    gaps = np.diff(arm.at)
+    assert np.delete(gaps, 9) == pytest.approx([0.02] * 18)
+    assert gaps[9] > 1.0
+
+
 def test_in_real_time_a_long_delay_is_not_made_up_for():
     clock = WallClock()
     arm = SlowArm(clock, [0.004, 0.004, 0.3])
