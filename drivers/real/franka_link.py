@@ -26,6 +26,8 @@ T = TypeVar("T")
 ARM_PORT, HAND_PORT = 1337, 1338
 #: so long may the robot's own clock stand still while its state is read [s]
 SILENCE = 0.8
+#: what one look at a clock that stands still counts for at most [s]
+_LOOK = 0.25
 
 _opening: defaultdict[tuple[str, int], threading.Lock] = defaultdict(threading.Lock)
 
@@ -110,7 +112,7 @@ class RobotTime:
         self.rate = rate
         self._begun = False
         self._first = self._base = self._slot = self._newest = 0
-        self._advanced = 0.0
+        self._advanced = self._looked = self._stood = 0.0
 
     @property
     def now(self) -> float:
@@ -122,14 +124,19 @@ class RobotTime:
         missed = 0 if last is None else floor((monotonic() - self._advanced) * self.rate)
         self._base = 0 if last is None else last + 1 + missed
         self._begun = False
-        self._advanced = monotonic()
+        self._advanced = self._looked = monotonic()
+        self._stood = 0.0
 
     def take(self, time_ms: int) -> int | None:
         """The number of the reading that a state of ``time_ms`` is; None where none is due yet."""
         if not self._begun:
             self._begun, self._first, self._slot, self._newest = True, time_ms, -1, time_ms - 1
+        now = monotonic()
         if time_ms > self._newest:
-            self._newest, self._advanced = time_ms, monotonic()
+            self._newest, self._advanced, self._stood = time_ms, now, 0.0
+        else:  # a computer that stood still for a while itself has looked once in it
+            self._stood += min(now - self._looked, _LOOK)
+        self._looked = now
         slot = floor((self._newest - self._first) * 1e-3 * self.rate + 1e-9)
         if slot <= self._slot:
             return None
@@ -144,8 +151,8 @@ class RobotTime:
 
     @property
     def silent(self) -> float:
-        """How long the robot's clock has been standing still [s]."""
-        return monotonic() - self._advanced
+        """How long the robot's clock has been seen to stand still, and nobody has looked since [s]."""
+        return self._stood + monotonic() - self._looked
 
 
 def _said(error: Exception) -> str:

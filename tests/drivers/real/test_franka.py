@@ -33,6 +33,7 @@ def robot() -> Iterator[Witness]:
 @pytest.fixture
 def arm(robot: Witness) -> Iterator[FrankaArm]:
     with connected(robot.emulator.host) as arm:
+        arm.recover()  # whatever the test before has left
         arm.acquire("test")
         yield arm
 

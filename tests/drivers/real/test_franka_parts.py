@@ -105,6 +105,24 @@ def test_readings_are_numbered_by_the_robots_clock_so_that_a_skip_is_a_loss():
     assert first is not None and first >= 6
 
 
+def test_a_clock_stands_still_while_it_is_looked_at_and_not_while_this_computer_slept(monkeypatch):
+    now = 100.0
+    monkeypatch.setattr("drivers.real.franka_link.monotonic", lambda: now)
+    clock = RobotTime(100.0)
+    clock.restart(None)
+    clock.take(5000)
+    now += 3.0  # nobody looked
+    assert clock.silent == pytest.approx(3.0)
+    clock.take(5000)
+    assert clock.silent < 0.5, "one look in three seconds tells little of the robot"
+    for _ in range(1000):
+        now += 0.001
+        clock.take(5000)
+    assert clock.silent == pytest.approx(1.0, abs=0.5)
+    clock.take(5001)
+    assert clock.silent == 0
+
+
 def planar_arm(q):
     """Two links of 1 m in the plane z = 0, and four joints that turn the hand; a flange that turns with all of them."""
     R1, R12 = Rotation.from_euler("z", q[0]), Rotation.from_euler("z", q[0] + q[1])
