@@ -151,7 +151,7 @@ class RobotTime:
 
     @property
     def silent(self) -> float:
-        """How long the robot's clock has been seen to stand still, and nobody has looked since [s]."""
+        """How long the robot's clock has been seen to stand still, with the time since the last look [s]."""
         return self._stood + monotonic() - self._looked
 
 
