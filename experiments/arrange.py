@@ -15,23 +15,20 @@ from planning.plan import Plan
 def arrange(context: RunContext, devices: Devices, plan: Plan, trial: int) -> None:
     """Put the scene into the state that ``trial`` of ``plan`` begins with.
 
-    The simulated world does it by itself; a person is asked by the trial, which looks at the tags. Raises DriverError.
+    The simulated world does it by itself, and holds until `let_go` an extrinsic object that would not stand so; a
+    person is asked by the trial, which looks at the tags. Raises DriverError.
     """
     eo = resting_eo(plan)
     scene = setup.scene(context.resolved, None if eo is None else (float(eo[0]), float(eo[1]), float(eo[2])))
     if devices.simulation is not None:
-        context.begin(scene, trial=trial)
+        context.begin(scene, trial=trial, held="eo" if plan.supported else None)
     elif eo is not None:
         _lift(context, devices, scene.start[1])
 
 
-def hold(devices: Devices, plan: Plan, phase: str) -> None:
-    """Let the simulated world hold a tilted extrinsic object until the go does, as a person's hand would."""
-    if not plan.supported or devices.simulation is None:
-        return
-    if phase == "approach":
-        devices.simulation.clamp("eo")
-    elif phase == "trajectory":
+def let_go(devices: Devices, plan: Plan) -> None:
+    """Let the simulated world's hand off a tilted extrinsic object: from now on the go holds it."""
+    if plan.supported and devices.simulation is not None:
         devices.simulation.clamp(None)
 
 

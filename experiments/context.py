@@ -96,12 +96,12 @@ class RunContext:
             self._look_at_clocks(devices)
         return self._devices
 
-    def begin(self, scene: Scene, *, part: int = 0, trial: int | None = None) -> None:
+    def begin(self, scene: Scene, *, part: int = 0, trial: int | None = None, held: str | None = None) -> None:
         """Begin a trial or a calibration: the simulated world is as after a reset, with ``scene``, and time goes on.
 
         Nothing of what ran before has a say in what comes, so a run that was cut off can go on here. With ``trial`` the
-        go is taken into the fingers as that trial has it; ``part`` is the number of what is no trial. On a real station
-        things are as they are.
+        go is taken into the fingers as that trial has it; ``part`` is the number of what is no trial. The body ``held``
+        is held where it is, as by a person's hand, before any time passes. On a real station things are as they are.
         """
         devices = self.devices()
         self._fingers = None  # they remember what pressed them
@@ -112,6 +112,8 @@ class RunContext:
         devices.simulation.restage(scene.model_dump(), part)
         if trial is not None:
             devices.simulation.regrasp(trial)
+        if held is not None:
+            devices.simulation.clamp(held)
         devices.clock.sleep(WARM_UP)
 
     def note_health(self) -> None:

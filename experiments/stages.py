@@ -18,7 +18,7 @@ from control.trial import Trial, TrialResult, Watch
 from drivers.errors import DeviceTimeout, DriverError, SimulationDiverged
 from drivers.station import Devices
 from experiments import kernels, looks, registries, setup
-from experiments.arrange import arrange, hold
+from experiments.arrange import arrange, let_go
 from experiments.context import RunContext
 from experiments.faults.inject import Injector
 from experiments.metrics import contact_of, errors_of, witness_of
@@ -135,8 +135,8 @@ def _one_trial(
 
         def on_phase(phase: str, fraction: float) -> None:
             context.write(PhaseRecord(devices.clock.now_ns(), name, phase))
-            if fraction == 0.0:
-                hold(devices, plan, phase)
+            if (phase, fraction) == ("trajectory", 0.0):
+                let_go(devices, plan)
             if fraction in (0.0, 1.0):
                 faults.phase(phase)
 
