@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from estimation.elasticity_methods import Samples
 from estimation.errors import FitError
@@ -69,7 +69,7 @@ def maximum_likelihood(samples: Samples, start: Array, terms: bool | tuple[str, 
         _, q, lower = tried[best]
         added, freedom = len(q) - len(p), samples.w.size - len(q) - 3 * samples.drift.shape[1]
         ratio = (cost - lower) / added / (lower / freedom)
-        if fisher.sf(ratio, added, freedom) > SIGNIFICANCE:
+        if fdtrc(added, freedom, ratio) > SIGNIFICANCE:
             break
         kept, p, cost = (*kept, best), q, lower
         candidates.remove(best)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.special import expit, logsumexp, ndtr
-from scipy.stats import norm
+from scipy.special import expit, logsumexp, ndtr, ndtri
 
 from estimation.errors import FitError
 from mechanics.readings import Array
@@ -148,7 +147,7 @@ class Cone:
         of = self._responsibilities(p)
         covariance = np.linalg.pinv(_hessian(self._cost, z, np.full(len(z), 0.05)), hermitian=True)
         variance = covariance[0, 0] * self._unit[0] ** 2 + 2 * (gain_error * mu) ** 2
-        half = float(norm.ppf(0.975)) * float(np.sqrt(max(variance, 0.0)))
+        half = float(ndtri(0.975)) * float(np.sqrt(max(variance, 0.0)))
         signs = np.sign(self._force[:, 1] - p[2])
         firm = (signs[:, None] == (-1, 1)) & (of[:, :1] > 0.5)
         sides = tuple(side for side, seen in zip((-1, 1), firm.sum(axis=0), strict=True) if seen >= 0.5 * _SLIPPING)
@@ -234,7 +233,7 @@ class StrokeCone(Cone):
         size = STROKE_ERROR * np.exp(p[PARAMETERS])
         joint = np.einsum("osc,sc->os", self._densities(p, offsets[:, self._stroke]), self._shares(p))
         samples = np.add.reduceat(np.log(np.maximum(joint, 1e-300)), self._begins, axis=1)
-        return samples + norm.logpdf(offsets / size) - np.log(size)
+        return samples - (offsets / size) ** 2 / 2 - np.log(np.sqrt(2 * np.pi)) - np.log(size)
 
     def _peaks(self, p: Array) -> tuple[Array, Array]:
         """The likeliest offset (strokes,) of each stroke [N], and how wide its peak is, 1 sigma.

@@ -16,7 +16,7 @@ from bisect import bisect_right
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from estimation.tactile_pose import GraspPrior, left_difference, left_moved
 from mechanics import se2
@@ -162,7 +162,7 @@ class GraspFilter:
         joint = np.linalg.inv(before.covariance + np.diag(self.noise.floor) ** 2) + information
         weight = information - information @ np.linalg.solve(joint, information)
         seen = int((np.linalg.eigvalsh(_scaled(information)) > 1.0).sum())
-        return bool(off @ weight @ off > chi2.isf(self.noise.gate, max(seen, 1)))
+        return bool(off @ weight @ off > chdtri(max(seen, 1), self.noise.gate))
 
     def _forget(self) -> None:
         horizon = self._kept[-1].capture_ns - round(self.memory * 1e9)
