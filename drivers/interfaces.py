@@ -167,6 +167,10 @@ class Sensor(Device, Generic[R]):
 
         return stop
 
+    def heard_beside(self, callback: Callable[[R], None]) -> bool:
+        """Whether anybody else than ``callback`` listens in this process."""
+        return any(listener != callback for listener in self._listeners)
+
     def _push(self, reading: R) -> None:
         with self._arrived:
             self._arrive(reading.stamp)

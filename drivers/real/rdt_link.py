@@ -29,7 +29,7 @@ class RdtLink:
 
     def __init__(self, peer: tuple[str, int], local_port: int, patience: float):
         """``patience`` [s] is how long `receive` waits."""
-        self._peer = peer
+        self._peer, self._patience, self._waits = peer, patience, True
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -49,11 +49,17 @@ class RdtLink:
         """Send a request; whether it arrives nobody says."""
         self._socket.sendto(rdt.request(command), self._peer)
 
-    def receive(self) -> tuple[bytes, tuple[str, int], int] | None:
-        """The next datagram, from where it came, and when [Unix ns]; None where none comes in time."""
+    def receive(self, wait: bool = True) -> tuple[bytes, tuple[str, int], int] | None:
+        """The next datagram, from where it came, and when [Unix ns]; None where none comes in time.
+
+        Without ``wait`` it is one that is here already.
+        """
         try:
+            if wait is not self._waits:  # a flag of the call would not do: Python waits before it
+                self._socket.settimeout(self._patience if wait else 0.0)
+                self._waits = wait
             datagram, ancillary, _, source = self._socket.recvmsg(_ROOM, 64)
-        except TimeoutError:
+        except (TimeoutError, BlockingIOError):
             return None
         return datagram, source, _arrival(ancillary)
 

@@ -41,7 +41,7 @@ from drivers.wire.streams import ViewRates
 PROTOCOL = 2
 TRUTH_PERIOD_NS = 20_000_000
 """Truth is published at 50 Hz of station time; in lockstep urgent work also waits no longer than this."""
-_PIECE = 0.002  # how much real time is simulated at once [s]
+_PIECE, _LEISURE = 0.002, 0.01  # how much real time is simulated at once, and while nobody takes any stream [s]
 _IDLE = 0.5
 _LAG = 0.05  # a world that is this late gives up the lost time, well before its readings count as old [s]
 
@@ -210,11 +210,17 @@ class Host:
             self.skipped_ns += int(behind * 1e9)
             log.warning("%s: the world was %.0f ms late and gave up the lost time", self.config.name, behind * 1e3)
             behind = _PIECE  # the sensors speak before anybody hears that so much time has passed
-        if behind < _PIECE:
-            return _PIECE - behind
-        self._step(int(_PIECE * 1e9))
+        piece = _PIECE if behind >= _LEISURE or self._heard() else _LEISURE
+        if behind < piece:
+            return piece - behind
+        with self.desk.together():
+            self._step(int(piece * 1e9))
         self._capture(simulated)
         return 0.0
+
+    def _heard(self) -> bool:
+        """Whether anybody takes a stream."""
+        return any(stream.heard() for stream in self.desk.publishers)
 
     def _capture(self, now: float) -> None:
         """Have the camera take its frame whose frame is due longest: one at a time, for commands wait meanwhile."""

@@ -221,7 +221,7 @@ class DeviceServer:
         if isinstance(device, Sensor):
             self._stops.append(device.listen(self._publish, self._publish_ruins))
         if isinstance(device, StreamingSensor):
-            device.wanted = self._taken
+            device.wanted = lambda: self._taken() or device.heard_beside(self._publish)
         self._serve("describe", lambda _: Answer(json.dumps(asdict(self.device.describe()))), direct=True)
         self._verbs()
         self._withdraw = self.desk.bus.token(topics.alive(self.desk.station, device.name))

@@ -84,6 +84,16 @@ def test_load_on_the_mounting_side_is_felt_with_the_opposite_sign():
         np.testing.assert_allclose(sensor.latest().wrench, np.negative(LOAD), atol=1e-6)
 
 
+def test_what_nobody_takes_is_read_in_heaps_and_each_has_its_own_instant():
+    with box_and_sensor(Load(*LOAD)) as (_, sensor):
+        sensor.wanted = lambda: False
+        stamps = [reading.stamp for reading in next_readings(sensor, 500)]
+    assert np.diff([stamp.sequence for stamp in stamps]).tolist() == [1] * 499
+    measured, read = (np.diff([getattr(s, name) for s in stamps]) * 1e-6 for name in ("capture_ns", "receive_ns"))
+    assert np.median(measured) == pytest.approx(1.0, rel=0.2)  # ms
+    assert np.median(read) < 0.2
+
+
 def theirs(box: NetFtBox) -> pynetft.Config:
     """How pynetft reaches the box; patiently, on a machine that has other work."""
     return pynetft.Config(
