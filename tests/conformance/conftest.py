@@ -1,125 +1,77 @@
 """The backends that the device contract is held against, and the table of how they fared.
 
 A backend is one entry of `BACKENDS`: a context manager that yields a `Lab` whose devices are open. A claim is held
-against every backend, or against those that it names: ``@pytest.mark.backends(*SIMULATED)``.
+against every backend, or against those that it names: ``@pytest.mark.backends(*SIMULATED)``. With ``--backend`` it is
+another package's, which is held to what a real one is.
 """
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from functools import partial
+from importlib import import_module
 from typing import cast
 
 import pytest
 
-from drivers.config import (
-    ArmConfig,
-    BusConfig,
-    ForceTorqueConfig,
-    GripperConfig,
-    StationConfig,
-    TactileConfig,
-    TagCameraConfig,
-    WorldConfig,
-)
-from drivers.scene import Body, Scene, TagMount
-from drivers.sim.soft_bubble import view_of
-from drivers.sim.world import World
-from drivers.station import Station
-from tests.conformance import emulated
-from tests.conformance.lab import Lab, losing_readings, losing_samples
+from drivers.config import StationConfig
+from experiments.ports import free_endpoint
+from tests.conformance import emulated, recorded
+from tests.conformance.lab import Lab
+from tests.conformance.simulated import SCENE, SIMULATED, station
 
-START = (0.0, 0.25, 0.1)
-
-SCENE = Scene(
-    grasped=Body(
-        name="tall_box",
-        vertices=((-0.025, -0.07345), (0.025, -0.07345), (0.025, 0.07345), (-0.025, 0.07345)),
-        mass=0.1,
-        tag=TagMount(id=3, size=0.036, pose=(0.0, -0.04, 0.0), height=0.01),  # below the fingers
-    ),
-    grasp=(0.0, 0.045, 0.0),
-    stiffness=((2209.0, 0.0, 0.0), (0.0, 1876.0, 0.0), (0.0, 0.0, 3.2)),
-    friction={"go-ground": 0.33},
-    start=START,
-).model_dump(mode="json")
+Backend = Callable[[], AbstractContextManager[Lab]]
 
 
-@contextmanager
-def in_process(config: StationConfig) -> Iterator[Lab]:
-    """The simulated devices themselves; a second client shares them."""
-    world = World(config)
-
-    @contextmanager
-    def join() -> Iterator[Lab]:
-        yield lab
-
-    lab = Lab(world.devices, world, world, join, losing_readings)
-    for device in world.devices.values():
-        device.connect()
-    yield lab
-    for device in world.devices.values():
-        device.close()
+def simulated(open_station: Callable[[StationConfig], AbstractContextManager[Lab]]) -> AbstractContextManager[Lab]:
+    """A simulated station, opened in one way or the other."""
+    return open_station(station())
 
 
-@contextmanager
-def over_zenoh(config: StationConfig) -> Iterator[Lab]:
-    """The simulated devices in a host process, over the bus; a second client is a second session."""
-    with Station(config).connect() as devices:
-        assert devices.simulation is not None
-        yield Lab(devices, devices.clock, devices.simulation, lambda: over_zenoh(config), losing_samples)
-
-
-SIMULATED: dict[str, Callable[[StationConfig], AbstractContextManager[Lab]]] = {
-    "sim in process": in_process,
-    "sim over zenoh": over_zenoh,
-}
-
-
-@contextmanager
-def simulated(open_station: Callable[[StationConfig], AbstractContextManager[Lab]]) -> Iterator[Lab]:
-    """A simulated station with a device of every kind."""
-    config = StationConfig(
-        name="bench",
-        world=WorldConfig(),
-        bus=BusConfig(endpoint=free_endpoint()),
-        devices={
-            "arm": ArmConfig(kind="arm"),
-            "gripper": GripperConfig(kind="gripper"),
-            "wrist_ft": ForceTorqueConfig(kind="force_torque", mount="wrist"),
-            "camera": TagCameraConfig(
-                kind="tag_camera", width=640, height=480, focal=600.0, position=(0, -0.5, 0.2), look_at=(0, 0, 0.2)
-            ),
-            "bubble": TactileConfig(kind="tactile", sensor="soft_bubble", finger="left", indentation=0.016),
-            "gel": TactileConfig(kind="tactile", sensor="gelslim", finger="right", width=160, height=120),
-        },
-    )
-    bubble = config.devices["bubble"]
-    assert isinstance(bubble, TactileConfig)
-    view_of(bubble)  # compiled once per installation, which takes longer than a frame may
-    with open_station(config) as lab:
-        yield lab
-
-
-BACKENDS: dict[str, Callable[[], AbstractContextManager[Lab]]] = {
+BACKENDS: dict[str, Backend] = {
     **{name: partial(simulated, opened) for name, opened in SIMULATED.items()},
     "real": emulated.in_process,
     "real over zenoh": emulated.over_zenoh,
+    "replay": recorded.in_process,
+    "replay over zenoh": recorded.over_zenoh,
 }
 
 
-def free_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+#: what says little that the others do not say, and takes its time
+SLOW = ("replay over zenoh",)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    what = "hold this backend against the contract instead of ours: a context manager that yields a Lab"
+    parser.addoption("--backend", action="append", default=[], metavar="NAME=MODULE:FUNCTION", help=what)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    foreign: dict[str, Backend] = {}
+    for text in config.getoption("--backend") or ():
+        name, is_named, where = text.partition("=")
+        module, is_placed, function = where.partition(":")
+        if not (is_named and is_placed):
+            raise pytest.UsageError(f"--backend {text}: expected NAME=MODULE:FUNCTION")
+        try:
+            foreign[name] = getattr(import_module(module), function)
+        except (ImportError, AttributeError) as error:
+            raise pytest.UsageError(f"--backend {text}: {error}") from error
+    if foreign:
+        BACKENDS.clear()
+        BACKENDS.update(foreign)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    if "opened" in metafunc.fixturenames:
-        mark = metafunc.definition.get_closest_marker("backends")
-        metafunc.parametrize("opened", list(BACKENDS if mark is None else mark.args), indirect=True, scope="module")
+    if "opened" not in metafunc.fixturenames:
+        return
+    mark = metafunc.definition.get_closest_marker("backends")
+    named = list(BACKENDS if mark is None else mark.args)
+    if metafunc.config.getoption("--backend"):  # another package's is a real one
+        named = list(BACKENDS if mark is None or "real" in mark.args else ())
+    backends = [pytest.param(name, marks=[pytest.mark.slow] if name in SLOW else []) for name in named]
+    metafunc.parametrize("opened", backends, indirect=True, scope="module")
 
 
 @pytest.fixture(scope="module")
@@ -132,8 +84,11 @@ def opened(request: pytest.FixtureRequest) -> Iterator[Lab]:
 @pytest.fixture
 def lab(opened: Lab) -> Lab:
     """The station as new: every device open, the arm free, a world at its start."""
+    opened.renew()
     for device in opened.devices.values():
         device.connect()
+    if "arm" not in opened.names:
+        return opened
     arm = opened.of("arm")
     arm.release()
     arm.recover()

@@ -24,7 +24,7 @@ from drivers.station import Station
 from drivers.tags import tag_bitmap
 from drivers.wire.station_bus import station_bus
 from experiments.ports import free_endpoint
-from tests.conformance.lab import Lab, losing_readings, losing_samples
+from tests.conformance.lab import Lab, WallClock, losing_readings, losing_samples
 from tests.drivers.real.bubbles import bubble_playback
 
 NAMES = {"arm": "arm", "gripper": "gripper", "force_torque": "wrist_ft", "tag_camera": "camera", "tactile": "gel"}
@@ -33,18 +33,6 @@ START, LOAD, BLOCK = (0.0, 0.25, 0.1), (0.3, 0.0, -1.0, 0.01, 0.02, 0.0), 0.03
 #: what a Franka in its simulator reaches a set-point to [m, m, rad]
 ACCURACY = (5e-4, 5e-4, 2e-3)
 TAG = 3
-
-
-class WallClock:
-    """The time of real devices."""
-
-    lockstep = False
-
-    def now_ns(self) -> int:
-        return time.time_ns()
-
-    def sleep(self, seconds: float) -> None:
-        time.sleep(seconds)  # station time, which here is everybody's
 
 
 def tag_picture() -> np.ndarray:

@@ -14,11 +14,14 @@ from drivers.interfaces import Clock, Device, Simulation
 
 SIMULATED = ("sim in process", "sim over zenoh")
 LIVE = (*SIMULATED, "real", "real over zenoh")
+REPLAYED = ("replay", "replay over zenoh")
 
 #: what only a world that stands still between two calls can be held to
 in_lockstep = pytest.mark.backends(*SIMULATED)
-#: and what can be commanded
+#: what can be commanded
 live = pytest.mark.backends(*LIVE)
+#: and what only tells what it was told
+replayed = pytest.mark.backends(*REPLAYED)
 
 
 def about(kind: str) -> Callable:
@@ -41,13 +44,26 @@ SIM_NAMES = {
 }
 
 
+class WallClock:
+    """The time of what is not simulated."""
+
+    lockstep = False
+
+    def now_ns(self) -> int:
+        return time.time_ns()
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(seconds)  # station time, which here is everybody's
+
+
 @dataclass
 class Lab:
     """An open station as its user sees it.
 
     ``names`` are its devices by kind. ``join`` opens it a second time, for another client; ``losing`` is a context in
     which what a device sends does not arrive. ``accuracy`` (3,) [m, m, rad] is how well its arm reaches a set-point.
-    Without a ``simulation`` the devices are real ones, at emulators, or a recording; time passes by itself.
+    Without a ``simulation`` the devices are real ones, at emulators, or a recording; time passes by itself. ``renew``
+    puts it back to its begin before each claim.
     """
 
     devices: Mapping[str, Device]
@@ -59,9 +75,12 @@ class Lab:
     accuracy: tuple[float, float, float] = (1e-6, 1e-6, 1e-6)
     #: the time [s] that a device of a kind lives by: an emulated robot on a busy machine is slower than the wall
     own_time: Callable[[str], float] = lambda _kind: time.monotonic()
+    renew: Callable[[], None] = lambda: None
 
     def of(self, kind: str) -> Any:
-        """The device of a kind."""
+        """The device of a kind; the claim is not for a backend that has none."""
+        if kind not in self.names:
+            pytest.skip(f"the backend has no {kind}")
         return self.devices[self.names[kind]]
 
     @property

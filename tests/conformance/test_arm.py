@@ -10,7 +10,7 @@ import pytest
 
 from drivers.errors import CommandRefused
 from drivers.interfaces import ArmTarget
-from tests.conformance.lab import about, live
+from tests.conformance.lab import about, live, replayed
 
 pytestmark = pytest.mark.alone
 
@@ -81,7 +81,6 @@ def test_arm_goes_to_its_target(lab, arm):
 
 
 @about("arm")
-@live
 def test_command_without_the_lease_is_refused(lab, arm):
     before = at_rest(lab, arm)
     with pytest.raises(CommandRefused) as caught:
@@ -93,12 +92,19 @@ def test_command_without_the_lease_is_refused(lab, arm):
 
 
 @about("arm")
-@live
 def test_second_commander_is_refused(lab, arm):
     with arm.lease("first"), lab.join() as other, pytest.raises(CommandRefused):
         other.of("arm").acquire("second")
     with lab.join() as other, other.of("arm").lease("second"):
         pass
+
+
+@about("arm")
+@replayed
+def test_a_recorded_arm_refuses_to_move(lab):
+    arm = lab.of("arm")
+    with arm.lease("test"), pytest.raises(CommandRefused, match="a recording does not move"):
+        arm.command(ArmTarget(arm.latest(10.0).pose, np.zeros(3), 0.5))
 
 
 @about("arm")

@@ -13,7 +13,7 @@ from scipy.stats import theilslopes
 
 from drivers.errors import CommandRefused, DeviceTimeout, NotConnected
 from mechanics.readings import Status
-from tests.conformance.lab import about, in_lockstep, live
+from tests.conformance.lab import about, in_lockstep, live, replayed
 
 pytestmark = pytest.mark.alone  # with `test_arm`, so that there is one table
 
@@ -98,7 +98,6 @@ def test_streams_at_its_declared_rate(lab, kind):
 
 
 @every_stream
-@live
 def test_a_stream_keeps_its_declared_rate(lab, kind):
     device = lab.of(kind)
     lab.clock.sleep(0.3)
@@ -232,7 +231,6 @@ def test_the_wrist_feels_the_weight_of_what_is_held(lab):
 
 
 @about("force_torque")
-@live
 def test_tare_zeroes_the_load(lab):
     wrist = lab.of("force_torque")
     lab.clock.sleep(0.2)
@@ -266,6 +264,15 @@ def test_gripper_refuses_a_force_without_meaning(lab, force):
         lab.of("gripper").grasp(force)
 
 
+@about("gripper")
+@replayed
+def test_a_recorded_gripper_refuses_to_move(lab):
+    gripper = lab.of("gripper")
+    for move in (lambda: gripper.grasp(20.0), gripper.release):
+        with pytest.raises(CommandRefused, match="a recording does not move"):
+            move()
+
+
 @about("tag_camera")
 @in_lockstep
 def test_camera_captures_at_the_present_instant(lab):
@@ -282,7 +289,6 @@ def test_camera_captures_at_the_present_instant(lab):
 
 
 @about("tag_camera")
-@live
 def test_camera_captures_a_frame_that_was_exposed_after_it_was_asked(lab):
     camera = lab.of("tag_camera")
     lab.clock.sleep(0.3)
@@ -297,7 +303,6 @@ def test_camera_captures_a_frame_that_was_exposed_after_it_was_asked(lab):
 
 
 @about("tag_camera")
-@live
 def test_camera_keeps_the_picture_behind_its_reading(lab):
     camera = lab.of("tag_camera")
     lab.clock.sleep(0.1)
@@ -389,7 +394,6 @@ def test_finger_says_which_it_is(lab, name):
 
 
 @about("tactile")
-@live
 @every_finger
 def test_finger_captures_a_frame_that_was_exposed_after_it_was_asked(lab, name):
     finger = lab.devices.get(name)

@@ -18,7 +18,7 @@ from ruamel.yaml import YAML
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "add-a-device.md"
-FILES = ("pyproject.toml", "acme_cell.py", "acme_emulator.py", "bench.yaml", "test_acme_cell.py")
+FILES = ("pyproject.toml", "acme_cell.py", "acme_emulator.py", "bench.yaml", "test_acme_cell.py", "acme_conformance.py")
 #: as they stand on the page: another program may have them here
 PORT, BUS = "5005", "7450"
 
@@ -156,3 +156,13 @@ def test_the_contract_that_the_page_has_for_a_package_of_ones_own_is_kept(packag
     code, said = finished(package, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_acme_cell.py")
     assert code == 0, said
     assert "6 passed" in said
+
+
+def test_the_whole_contract_is_held_against_it_by_name(package):
+    page = PAGE.read_text()
+    [command] = re.findall(r"^PYTHONPATH=\S+ pytest (.*--backend.*)$", page, re.MULTILINE)
+    words = [str(ROOT / word) if word.endswith(".py") else word for word in command.split()]
+    code, said = finished(package, "-m", "pytest", "-p", "no:cacheprovider", "-c", str(ROOT / "pyproject.toml"), *words)
+    assert code == 0, said
+    assert re.search(r"^force_torque +12 of 12$", said, re.MULTILINE), said
+    assert " failed" not in said
