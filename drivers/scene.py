@@ -36,7 +36,7 @@ class Body(Strict):
     name: str
     vertices: tuple[Vector2, ...]
     mass: float = Field(gt=0)
-    tag: TagMount | None = None
+    tags: tuple[TagMount, ...] = ()
 
 
 class Scene(Strict):

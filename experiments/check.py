@@ -195,7 +195,7 @@ def _device_problems(resolved: Resolved) -> list[Problem]:
             problems.append(resolved.experiment_document.problem(("trial", "approach_speed"), wrong, expected))
     if not station.table_tags:
         problems.append(document.problem(("table_tags",), "the table has no tags", "at least one tag"))
-    if resolved.grasped.tag is None:
+    if not resolved.grasped.all_tags:
         wrong = f"{resolved.grasped.name} has no tag: the camera could not see it"
         problems.append(resolved.experiment_document.problem(("grasped_object",), wrong, "an object with a `tag`"))
     return problems

@@ -317,13 +317,11 @@ def _tag_problems(resolved: Resolved) -> list[Problem]:
             )
         owners[mount.id] = f"table_tags.{i}"
     for key, shape in (("grasped_object", resolved.grasped), ("extrinsic_object", resolved.extrinsic)):
-        tag = None if shape is None else shape.tag
-        if tag is None:
-            continue
-        if tag.id in owners:
-            wrong = f"its tag has the id {tag.id}, as has {owners[tag.id]}"
-            problems.append(resolved.experiment_document.problem((key,), wrong, "an id of its own for each tag"))
-        owners[tag.id] = key
+        for tag in () if shape is None else shape.all_tags:
+            if tag.id in owners:
+                wrong = f"its tag has the id {tag.id}, as has {owners[tag.id]}"
+                problems.append(resolved.experiment_document.problem((key,), wrong, "an id of its own for each tag"))
+            owners[tag.id] = key
     return problems
 
 

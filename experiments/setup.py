@@ -48,8 +48,8 @@ def tags(resolved: Resolved) -> dict[str, tuple[TagGeometry, ...]]:
     """The tags of each body: ``table`` from the station, ``go`` and ``eo`` from the objects."""
     found = {"table": tuple(_geometry(mount) for mount in resolved.station.table_tags)}
     for body, shape in (("go", resolved.grasped), ("eo", resolved.extrinsic)):
-        tag = None if shape is None else shape.body(body)["tag"]
-        found[body] = () if tag is None else (_geometry(TagMount.model_validate(tag)),)
+        mounts = () if shape is None else Body.model_validate(shape.body(body)).tags
+        found[body] = tuple(_geometry(mount) for mount in mounts)
     return found
 
 
@@ -121,11 +121,10 @@ def believed(resolved: Resolved, calibrations: Calibrations) -> Believed:
     elasticity = calibrations.elasticity(resolved)
     hung = calibrations.of(ForceTorqueCalibration)
     camera = calibrations.of(CameraCalibration)
-    seat = calibrations.tag(resolved)
+    seats = calibrations.tags(resolved)
     clock = calibrations.of(ClockCalibration)
     seen = tags(resolved)
-    if seat is not None:
-        seen["go"] = tuple(replace(tag, pose=seat.pose) if tag.id == seat.id else tag for tag in seen["go"])
+    seen["go"] = tuple(replace(tag, pose=seats[tag.id].pose) if tag.id in seats else tag for tag in seen["go"])
     return Believed(
         resolved.sensor.stiffness if elasticity is None else elasticity.K,
         {**resolved.friction, **{pair: found.mu for pair, found in calibrations.friction(resolved).items()}},

@@ -6,10 +6,10 @@ import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from mechanics.polygon import Polygon, PolygonError
 from mechanics.readings import Array
@@ -53,10 +53,19 @@ def _outline(vertices: tuple[Vector2, ...]) -> tuple[Vector2, ...]:
     return vertices
 
 
+def _each_once(tags: tuple[TagModel, ...]) -> tuple[TagModel, ...]:
+    ids = [tag.id for tag in tags]
+    for i, number in enumerate(ids):
+        if number in ids[:i]:
+            raise Refusal(f"tag {number} stands twice", "an id of its own for each tag", at=(i, "id"))
+    return tags
+
+
 class ObjectModel(_Model):
     """A rigid polygon of uniform density. ``vertices_mm`` may have any origin; the object's frame is the centroid's.
 
-    ``friction`` is the Coulomb coefficient with the ground and with another object.
+    ``friction`` is the Coulomb coefficient with the ground and with another object. It carries one ``tag``, or several
+    ``tags``, all of which tell of its pose.
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
@@ -64,6 +73,20 @@ class ObjectModel(_Model):
     mass: float = Field(gt=0, le=100, description="mass [kg]")
     friction: float = Field(default=0.33, gt=0, le=10, description="Coulomb coefficient")
     tag: TagModel | None = None
+    tags: Annotated[tuple[TagModel, ...], AfterValidator(_each_once)] = Field(
+        default=(), max_length=20, description="several tags, in place of `tag`"
+    )
+
+    @model_validator(mode="after")
+    def _one_or_several(self) -> Self:
+        if self.tag is not None and self.tags:
+            raise Refusal("both `tag` and `tags`", "one of them", at=("tag",))
+        return self
+
+    @property
+    def all_tags(self) -> tuple[TagModel, ...]:
+        """Those that it carries."""
+        return self.tags if self.tag is None else (self.tag,)
 
     @cached_property
     def polygon(self) -> Polygon:
@@ -72,14 +95,17 @@ class ObjectModel(_Model):
 
     def body(self, name: str) -> dict[str, Any]:
         """The object as the mapping a scene's body is made of: SI, in the object's frame."""
-        tag = self.tag and {
-            "id": self.tag.id,
-            "size": self.tag.size_mm * 1e-3,
-            "pose": (*(v * 1e-3 for v in self.tag.position_mm), float(np.radians(self.tag.angle_deg))),
-            "height": self.tag.height_mm * 1e-3,
-        }
+        tags = tuple(
+            {
+                "id": tag.id,
+                "size": tag.size_mm * 1e-3,
+                "pose": (*(v * 1e-3 for v in tag.position_mm), float(np.radians(tag.angle_deg))),
+                "height": tag.height_mm * 1e-3,
+            }
+            for tag in self.all_tags
+        )
         vertices = tuple((float(x), float(y)) for x, y in self.polygon.vertices)
-        return {"name": name, "vertices": vertices, "mass": self.mass, "tag": tag}
+        return {"name": name, "vertices": vertices, "mass": self.mass, "tags": tags}
 
 
 def _stiffness(K: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:

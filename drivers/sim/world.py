@@ -347,8 +347,8 @@ class World:
         plant = self.plant("world", "look at the tags")
         tags = [(mount, np.zeros(3)) for mount in self.config.table_tags]
         for body, pose in ((self.scene.grasped, plant.go), (self.scene.extrinsic, plant.eo)):
-            if body is not None and body.tag is not None and pose is not None:
-                tags.append((body.tag, pose))
+            if body is not None and pose is not None:
+                tags += [(mount, pose) for mount in body.tags]
         if not self.profile.camera.tag_bias.si.any():
             return tags
         return [(self._as_it_sits(mount), pose) for mount, pose in tags]
@@ -357,7 +357,7 @@ class World:
         """Velocity (3,) in W, (ẋ, ẏ, θ̇), of the objects, by the ids of their tags."""
         plant = self.plant("world", "look at the tags")
         bodies = {"go": self.scene.grasped, "eo": self.scene.extrinsic}
-        return {body.tag.id: plant.twist(name) for name, body in bodies.items() if body is not None and body.tag}
+        return {tag.id: plant.twist(name) for name, body in bodies.items() if body is not None for tag in body.tags}
 
     def screens(self) -> list[Screen]:
         """What stands in front of the tags: the finger on the viewer's side, where the station has fingers."""

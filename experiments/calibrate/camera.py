@@ -18,7 +18,7 @@ from experiments.calibrate import store
 from experiments.calibrate.models import CameraCalibration, TagCalibration, vector3
 from experiments.calibrate.rig import Rig, at_hand
 from experiments.calibrate.schema import CameraStage
-from experiments.calibrate.seat import seat
+from experiments.calibrate.seat import seats
 from experiments.calibrate.threads import one_thread
 from experiments.context import RunContext
 from mechanics import se2
@@ -46,17 +46,17 @@ def camera_stage(context: RunContext, stage: CameraStage) -> None:
         start = CameraModel.from_dict(camera.describe().extra["camera"])
         lens = _lens(rig, stage, start, rng)
         place = _place(rig, stage, lens.camera, rng)
-        offset = seat(rig, place.camera, lambda: _averaged(rig, SEAT_FRAMES))
+        offsets = seats(rig, place.camera, lambda: _averaged(rig, SEAT_FRAMES))
         rig.home()
-    tag = context.believed.tags["go"][0]
-    context.calibrated(
-        TagCalibration(
-            origin=store.origin(resolved, (camera.name,), ("go",), context.folder.path.name),
-            id=tag.id,
-            pose=vector3(offset.pose),
-            deviation=vector3(np.sqrt(np.diag(offset.covariance))),
+    for number, offset in offsets.items():
+        context.calibrated(
+            TagCalibration(
+                origin=store.origin(resolved, (camera.name,), ("go",), context.folder.path.name),
+                id=number,
+                pose=vector3(offset.pose),
+                deviation=vector3(np.sqrt(np.diag(offset.covariance))),
+            )
         )
-    )
     context.calibrated(
         CameraCalibration(
             origin=store.origin(resolved, (camera.name, rig.devices.arm.name), (), context.folder.path.name),

@@ -142,6 +142,11 @@ def _named(print_: str) -> str:
     return print_.split(maxsplit=1)[0]
 
 
+def tag_name(object_: str, number: int) -> str:
+    """The file of tag ``number`` on an object."""
+    return f"tag-{object_}-{number}"
+
+
 def friction_name(pair: str, objects: Mapping[str, str]) -> str:
     """The file of a pair; ``objects`` maps ``go`` and ``eo`` to their fingerprints."""
     bodies = [_named(objects[body]) if body in objects else body for body in pair.split("-")]
@@ -176,7 +181,7 @@ class ForceTorqueCalibration(_Calibration):
 
 
 class TagCalibration(_Calibration):
-    """How the tag sits on the grasped object: its planar pose [m, m, rad] in the object's frame, and its 1 sigma."""
+    """How a tag sits on the grasped object: its planar pose [m, m, rad] in the object's frame, and its 1 sigma."""
 
     kind: Literal["tag"] = "tag"
     id: int = Field(ge=0)
@@ -185,8 +190,8 @@ class TagCalibration(_Calibration):
 
     @property
     def name(self) -> str:
-        """One file for each object."""
-        return f"tag-{_named(self.origin.objects['go'])}"
+        """One file for each tag of an object."""
+        return tag_name(_named(self.origin.objects["go"]), self.id)
 
 
 class CameraCalibration(_Calibration):

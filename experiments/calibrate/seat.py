@@ -1,4 +1,4 @@
-"""How the held object's tag sits on it: its corners touch the table while the camera looks (`estimation.tag_offset`).
+"""How the held object's tags sit on it: its corners touch the table while the camera looks (`estimation.tag_offset`).
 
 The object is set down flat, and on a corner tilted to either side. The table's own tags tell where the table is, so
 that neither the arm nor the grasp has a say.
@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.errors import DeviceFault
 from estimation.tag_offset import TagOffset, Touch, fit_tag_offset
-from estimation.tag_pose import TagPose, estimate_planar_pose
+from estimation.tag_pose import estimate_planar_pose
 from experiments.calibrate.rig import Rig
 from mechanics import se2
 from mechanics.camera import CameraModel, TagGeometry
@@ -31,21 +31,35 @@ _UP = np.array([0.0, 1.0, 0.0])
 Look = Callable[[], list[TagDetection]]
 
 
-def seat(rig: Rig, camera: CameraModel, look: Look) -> TagOffset:
-    """X_go_tag of the held object. Raises FitError, and DeviceFault where a tag or the table is not there."""
+def seats(rig: Rig, camera: CameraModel, look: Look) -> dict[int, TagOffset]:
+    """X_go_tag of each tag of the held object that was in view at every touch, by its id.
+
+    Raises FitError, and DeviceFault where no tag, or the table, is there.
+    """
     tags = rig.context.believed.tags
-    tag = tags["go"][0]
     polygon = rig.context.resolved.grasped.polygon
-    touches = []
+    touches: dict[int, list[Touch]] = {tag.id: [] for tag in tags["go"]}
     with rig.context.progress.steps("touches", len(TILTS)) as advance:
         for tilt in TILTS:
             corners = polygon.lowest_vertices(tilt)
             _set_down(rig, polygon.vertices[corners[0]], tilt)
-            X_T_tag, covariance = _seen(camera, look(), tag, tags["table"])
-            touches.append(Touch(X_T_tag, corners, covariance))
+            for number, (X_T_tag, covariance) in _seen(camera, look(), tags["go"], tags["table"]).items():
+                touches[number].append(Touch(X_T_tag, corners, covariance))
             rig.mover.ramp(rig.mover.pose + (PRESS + CLEAR) * _UP, 0.5)
             advance()
-    return fit_tag_offset(polygon.vertices, touches, np.array(tag.pose))
+    found = {}
+    for tag in tags["go"]:
+        if len(touches[tag.id]) < len(TILTS):
+            rig.context.event(
+                "warning", f"tag {tag.id} was not in view at every touch: it counts as it was to be stuck on"
+            )
+        else:
+            found[tag.id] = fit_tag_offset(polygon.vertices, touches[tag.id], np.array(tag.pose))
+    if not found:
+        raise DeviceFault(
+            "camera", "see the object's tags", "none is in view at every touch", "Clear the view onto one"
+        )
+    return found
 
 
 def _set_down(rig: Rig, corner: Array, tilt: float) -> None:
@@ -73,13 +87,15 @@ def _set_down(rig: Rig, corner: Array, tilt: float) -> None:
 
 
 def _seen(
-    camera: CameraModel, detections: list[TagDetection], tag: TagGeometry, table: tuple[TagGeometry, ...]
-) -> tuple[Array, Array]:
-    """The tag's pose over the table (3,) and its covariance."""
-    alone = estimate_planar_pose(camera, detections, [replace(tag, pose=(0.0, 0.0, 0.0))])
+    camera: CameraModel, detections: list[TagDetection], tags: tuple[TagGeometry, ...], table: tuple[TagGeometry, ...]
+) -> dict[int, tuple[Array, Array]]:
+    """The pose over the table (3,) of each tag that is in view, with its covariance, by its id."""
+    alone = {tag.id: estimate_planar_pose(camera, detections, [replace(tag, pose=(0.0, 0.0, 0.0))]) for tag in tags}
+    seen = {number: found for number, found in alone.items() if found is not None}
     ground = estimate_planar_pose(camera, detections, table)
-    for found, what in ((alone, "the object's tag"), (ground, "a tag of the table")):
-        if found is None:
+    for there, what in ((seen, "a tag of the object"), (ground, "a tag of the table")):
+        if not there:
             raise DeviceFault("camera", f"see {what}", "it is not in view", "Clear the view onto it")
-    assert isinstance(alone, TagPose) and isinstance(ground, TagPose)
-    return se2.compose(se2.inverse(ground.pose), alone.pose), alone.covariance + ground.covariance
+    assert ground is not None
+    back = se2.inverse(ground.pose)
+    return {n: (se2.compose(back, found.pose), found.covariance + ground.covariance) for n, found in seen.items()}

@@ -28,6 +28,7 @@ from experiments.calibrate.models import (
     TagCalibration,
     fingerprint,
     friction_name,
+    tag_name,
 )
 from experiments.calibrate.schema import FrictionStage
 from experiments.files import Resolved, laid_out
@@ -86,9 +87,10 @@ class Calibrations:
         """That of the experiment's sensor with its object."""
         return self.of(ElasticityCalibration, f"elasticity-{resolved.sensor.name}-{resolved.grasped.name}")
 
-    def tag(self, resolved: Resolved) -> TagCalibration | None:
-        """That of the grasped object's tag."""
-        return self.of(TagCalibration, f"tag-{resolved.grasped.name}")
+    def tags(self, resolved: Resolved) -> dict[int, TagCalibration]:
+        """Those of the grasped object's tags, by id."""
+        seats = [self.of(TagCalibration, name) for name in _tag_names(resolved)]
+        return {seat.id: seat for seat in seats if seat is not None}
 
     def friction(self, resolved: Resolved) -> dict[str, FrictionCalibration]:
         """By pair, for those pairs of the experiment that are known."""
@@ -208,13 +210,17 @@ def load(resolved: Resolved) -> Calibrations:
     return found
 
 
+def _tag_names(resolved: Resolved) -> list[str]:
+    return [tag_name(resolved.grasped.name, tag.id) for tag in resolved.grasped.all_tags]
+
+
 def _wanted(resolved: Resolved) -> list[str]:
     """The names of the files that this experiment has a use for."""
     objects = prints(resolved)
     return [
         f"elasticity-{resolved.sensor.name}-{resolved.grasped.name}",
         *(friction_name(pair, objects) for pair in resolved.friction),
-        f"tag-{resolved.grasped.name}",
+        *_tag_names(resolved),
         "force_torque",
         "camera",
         "clock",
@@ -226,7 +232,7 @@ def _remade(resolved: Resolved) -> set[str]:
     held, objects = resolved.grasped.name, prints(resolved)
     written = {
         "calibrate_force_torque": ["force_torque"],
-        "calibrate_camera": ["camera", f"tag-{held}"],
+        "calibrate_camera": ["camera", *_tag_names(resolved)],
         "calibrate_clock": ["clock"],
         "calibrate_elasticity": [f"elasticity-{resolved.sensor.name}-{held}"],
     }

@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.errors import ProtocolError
 from drivers.wire.log_reader import LogReader
-from experiments.calibrate.models import friction_name
+from experiments.calibrate.models import friction_name, tag_name
 from experiments.calibrate.samples import load_samples
 from experiments.calibrate.store import prints
 from experiments.files import Resolved, load
@@ -136,7 +136,10 @@ def _nominal(resolved: Resolved) -> list[dict[str, Any]]:
         },
         *frictions,
         *({"name": kind, "kind": kind} for kind in ("force_torque", "camera", "clock")),
-        {"name": f"tag-{go}", "kind": "tag", "of": go},
+        *(
+            {"name": tag_name(go, tag.id), "kind": "tag", "of": f"tag {tag.id} on {go}"}
+            for tag in resolved.grasped.all_tags
+        ),
     ]
 
 

@@ -29,7 +29,7 @@ SCENE = Scene(
         name="tall_box",
         vertices=((-0.025, -0.07345), (0.025, -0.07345), (0.025, 0.07345), (-0.025, 0.07345)),
         mass=0.1,
-        tag=TagMount(id=3, size=0.036, pose=(0.0, -0.04, 0.0), height=0.01),  # below the fingers
+        tags=(TagMount(id=3, size=0.036, pose=(0.0, -0.04, 0.0), height=0.01),),  # below the fingers
     ),
     grasp=(0.0, 0.045, 0.0),
     stiffness=((2209.0, 0.0, 0.0), (0.0, 1876.0, 0.0), (0.0, 0.0, 3.2)),

@@ -243,7 +243,7 @@ def lab() -> World:
     world.reset(
         1,
         {
-            "grasped": {"name": "go", "vertices": box, "mass": MASS, "tag": tag},
+            "grasped": {"name": "go", "vertices": box, "mass": MASS, "tags": [tag]},
             "grasp": tuple(GRASP),
             "stiffness": STIFFNESS.tolist(),
             "friction": {"go-ground": 0.33},

@@ -83,8 +83,7 @@ def test_figures_are_si_and_in_the_objects_frame():
     np.testing.assert_allclose(resolved.grasp, [0, 0.045, 0])
     assert resolved.friction == {"go-ground": 0.33}
     body = Body.model_validate(resolved.grasped.body("go"))
-    assert body.tag is not None
-    assert body.tag.id == 10
+    assert [tag.id for tag in body.tags] == [10]
 
 
 def test_the_camera_sees_the_table_tags_and_the_whole_grasped_object():
@@ -228,6 +227,22 @@ def test_two_tags_of_one_id_are_refused(elsewhere):
     assert (found.line, found.key) == (4, "extrinsic_object")
     assert "id 10" in found.wrong
     assert "tag 2 stands twice" in refused("grasped_static", "table_tags.0.id=2").wrong
+
+
+def test_a_bundle_has_ids_of_its_own_and_no_single_tag_beside_it(elsewhere):
+    one = "tag: {id: 40, size_mm: 20}"
+    (elsewhere / "pair.yaml").write_text(
+        TWO_OBJECTS.replace(one, "tags: [{id: 40, size_mm: 20}, {id: 40, size_mm: 9}]")
+    )
+    found = refused("pair.yaml")
+    assert found.key == "extrinsic_object.tags.1.id"
+    assert "tag 40 stands twice" in found.wrong
+    (elsewhere / "pair.yaml").write_text(
+        TWO_OBJECTS.replace(one, "tags: [{id: 41, size_mm: 20}, {id: 10, size_mm: 9}]")
+    )
+    assert "id 10" in refused("pair.yaml").wrong
+    (elsewhere / "pair.yaml").write_text(TWO_OBJECTS.replace(one, f"{one}, tags: [{{id: 41, size_mm: 20}}]"))
+    assert "both `tag` and `tags`" in refused("pair.yaml").wrong
 
 
 def test_a_grasp_outside_the_object_is_refused_in_millimetres():

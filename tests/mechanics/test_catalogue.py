@@ -86,7 +86,8 @@ def test_a_body_is_in_si():
     body = load_object("tall_box").body("go")
     assert body["name"] == "go"
     np.testing.assert_allclose(body["vertices"][0], [-0.025, -0.07345])
-    assert body["tag"] == {"id": 10, "size": pytest.approx(0.036), "pose": (0, pytest.approx(-0.04), 0), "height": 0.01}
+    [tag] = body["tags"]
+    assert tag == {"id": 10, "size": pytest.approx(0.036), "pose": (0, pytest.approx(-0.04), 0), "height": 0.01}
 
 
 @pytest.mark.parametrize(("name", "rho"), [("soft_bubble", 0.0448), ("gelslim", 1.0)])

@@ -166,7 +166,7 @@ def test_tags_sit_askew_by_the_figure(world_of, tall_box):
     figures = profile(camera={"tag_bias": {"xy_mm": [0.08, 0.04], "angle_deg": 0.1}})
     off = np.array([Lab(figures, seed).tag_bias(3) for seed in range(400)]) / [0.08e-3, 0.04e-3, np.radians(0.1)]
     assert [sigma_of(column) for column in off.T] == [about(1, 400)] * 3
-    body = tall_box.model_copy(update={"tag": TagMount(id=3, size=0.036, pose=(0.0, -0.04, 0.5))})
+    body = tall_box.model_copy(update={"tags": (TagMount(id=3, size=0.036, pose=(0.0, -0.04, 0.5)),)})
     world = world_of(figures, grasped=body)
     [(seen, pose)] = world.visible_tags()
     np.testing.assert_allclose(

@@ -111,7 +111,7 @@ def test_the_fingers_do_not_hide_the_tag_of_the_tall_box(fingers: str, make_scen
         name="tall_box",
         vertices=((-0.025, -0.07345), (0.025, -0.07345), (0.025, 0.07345), (-0.025, 0.07345)),
         mass=0.1,
-        tag=BOX_TAG,
+        tags=(BOX_TAG,),
     )
     camera = world.devices["camera"]
     assert isinstance(camera, SimTagCamera)

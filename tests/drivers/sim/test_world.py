@@ -195,11 +195,12 @@ def test_truth_has_the_planned_parts(world, make_scene):
 def test_visible_tags_ride_on_their_bodies(station, make_scene, tall_box):
     tags = (TagMount(id=10, size=0.04), TagMount(id=11, size=0.04, pose=(0.1, 0.0, 0.0)))
     world = World(station.model_copy(update={"table_tags": tags}))
-    own = TagMount(id=3, size=0.036, pose=(0.0, -0.04, 0.0))
-    world.reset(0, make_scene(grasped=tall_box.model_copy(update={"tag": own})))
+    own = TagMount(id=3, size=0.036, pose=(0.0, -0.04, 0.0)), TagMount(id=4, size=0.02, pose=(0.0, 0.05, 0.0))
+    world.reset(0, make_scene(grasped=tall_box.model_copy(update={"tags": own})))
     seen = {mount.id: pose for mount, pose in world.visible_tags()}
-    assert sorted(seen) == [3, 10, 11]
+    assert sorted(seen) == [3, 4, 10, 11]
     np.testing.assert_array_equal(seen[3], world.truth().go)
+    np.testing.assert_array_equal(seen[4], world.truth().go)
     np.testing.assert_array_equal(seen[11], [0.0, 0.0, 0.0])
 
 

@@ -239,7 +239,7 @@ def test_a_camera_renders_when_asked_and_the_picture_is_logged(tmp_path: Path) -
     with Station(station(camera=camera)).connect() as devices, devices.log(tmp_path / "log.mcap") as log:
         assert devices.simulation is not None
         tagged = scene()
-        tagged["grasped"]["tag"] = {"id": 10, "size": 0.036, "pose": (0.0, -0.04, 0.0)}
+        tagged["grasped"]["tags"] = [{"id": 10, "size": 0.036, "pose": (0.0, -0.04, 0.0)}]
         devices.simulation.reset(0, tagged)
         devices.clock.sleep(0.5)
         assert devices.simulation.counts()["sim/camera/detections"] == 0, "nothing is rendered unasked in lockstep"

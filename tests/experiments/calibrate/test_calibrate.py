@@ -79,7 +79,7 @@ def test_camera_tag_and_clocks_are_what_the_simulation_has(results: dict[str, An
     assert camera[0, 0] == pytest.approx(1400.0, abs=0.5)
     position = np.array(results["camera"]["camera"]["X_WC"])[:3, 3]
     np.testing.assert_allclose(position, [0.0, -0.55, 0.07], atol=3e-4)
-    seat = results["tag-tall_box"]
+    seat = results["tag-tall_box-10"]
     np.testing.assert_allclose(seat["pose"][:2], [0.0, -0.04], atol=1e-4)
     assert seat["pose"][2] == pytest.approx(0.0, abs=1e-3)
     delays = results["clock"]["delays"]

@@ -204,7 +204,7 @@ def build_calibrated():
         "camera": {"kind": "camera", "origin": origin(), "device": "camera", "focal_deviation": 1.3,
                    "camera": {"width": 1280, "height": 1024, "K": lens, "distortion": [0.0] * 5,
                               "X_WC": np.eye(4).tolist()}, "residual_px": 0.21, "views": 24},
-        "tag-tall_box": {"kind": "tag", "origin": origin(go=go), "id": 3, "pose": [0.0004, 0.0201, 0.0087266],
+        "tag-tall_box-3": {"kind": "tag", "origin": origin(go=go), "id": 3, "pose": [0.0004, 0.0201, 0.0087266],
                          "deviation": [0.00011, 0.00012, 0.0017453]},
         "clock": {"kind": "clock", "origin": origin(), "delays": {"wrist": {"delay": 0.00213, "deviation": 0.00054},
                                                                   "camera": {"delay": 0.0121, "deviation": 0.0011}}},
