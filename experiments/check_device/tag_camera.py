@@ -5,11 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from experiments.calibrate import store
+from experiments.calibrate.models import CameraCalibration
 from experiments.check_device.bench import Bench, Step
 from experiments.check_device.findings import Finding, judged
 from experiments.check_device.pictures import exposure
 from mechanics.camera import CameraModel, TagGeometry, point_in_world
 from mechanics.readings import TagReading
+from mechanics.yaml_input import InputError
 
 #: the least variance of the Laplacian of a picture that is in focus (grey levels²)
 SHARP = 20.0
@@ -52,8 +55,26 @@ def _tags(bench: Bench) -> Finding:
     return judged(bool(seen) and not missing, "; ".join(said), remedy, tags=sorted(seen))
 
 
+def _believed(bench: Bench) -> tuple[CameraModel, str]:
+    """The camera as it was calibrated on this station, else as the station file has it; and in words, which it is.
+
+    Raises InputError for a file that is no calibration.
+    """
+    config, said = bench.opened.config, bench.describe()
+    file = store.FOLDER / config.name / "camera.yaml"
+    if config.world is None and file.is_file():
+        found = store.read(file)
+        serial = config.devices[bench.opened.name].serial
+        if isinstance(found, CameraCalibration) and found.origin.devices.get(bench.opened.name) == serial:
+            return found.model, f"as calibrated on {found.origin.made:%Y-%m-%d}"
+    return CameraModel.from_dict(said.extra["camera"]), "as the station file has it"
+
+
 def _reprojection(bench: Bench) -> Finding:
-    model = CameraModel.from_dict(bench.describe().extra["camera"])
+    try:
+        model, which = _believed(bench)
+    except InputError as error:
+        return judged(False, str(error), "Calibrate the camera again (docs/calibrate.md), or take the file away")
     mounts = {mount.id: mount for mount in bench.opened.config.table_tags}
     off: dict[int, float] = {}
     for tag in _seen(bench).detections:
@@ -63,7 +84,7 @@ def _reprojection(bench: Bench) -> Finding:
             off[tag.id] = float(np.sqrt(((expected - tag.corners) ** 2).sum(axis=1).mean()))
     if not off:
         return judged(False, "no tag of the table is in view", "See the step before")
-    told = ", ".join(f"tag {id} {error:.1f} px" for id, error in sorted(off.items()))
+    told = f"{', '.join(f'tag {id} {error:.1f} px' for id, error in sorted(off.items()))}, the camera {which}"
     remedy = (
         "Measure the tags' places (`table_tags`) and the camera's (`position`, `look_at`, or `X_WC`), then calibrate "
         "it (docs/calibrate.md)"
@@ -75,5 +96,5 @@ def _reprojection(bench: Bench) -> Finding:
 STEPS = (
     Step("picture", "its size, light and focus", _picture, asks=True),
     Step("tags", "which tags it sees", _tags, asks=True),
-    Step("reprojection", "how far the table's tags are from where the station file has them", _reprojection, asks=True),
+    Step("reprojection", "how far the table's tags are from where it should see them", _reprojection, asks=True),
 )

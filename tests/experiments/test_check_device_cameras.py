@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 
 import cv2
 import numpy as np
@@ -12,9 +13,12 @@ import pytest
 from drivers.config import StationConfig
 from drivers.emulators.mjpeg_camera import MjpegCamera
 from drivers.tags import tag_bitmap
+from experiments.calibrate import store
+from experiments.calibrate.models import CameraCalibration, Origin
 from experiments.check_device.checklist import exit_code
 from experiments.check_device.findings import Verdict
 from experiments.exit_codes import ExitCode
+from mechanics.camera import CameraModel
 from tests.experiments.check_devices import Hand, findings, noisy, station
 from tests.experiments.check_devices import found as look
 
@@ -75,6 +79,26 @@ def test_a_camera_that_stands_elsewhere_is_told_by_how_many_pixels():
     assert found.verdict is Verdict.SHORT
     for off in found.figures["off_px"].values():
         assert off == pytest.approx(0.01 * FOCAL / DISTANCE, abs=0.7)
+
+
+def test_a_camera_that_was_calibrated_is_held_against_that(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with tag_camera(noisy(wall_of_tags(aside=0.01))) as config:
+        of = config.devices["camera"]
+        place = CameraModel.looking_at((-0.01, -DISTANCE - 0.03, 0.1), (-0.01, 0, 0.1), FOCAL, 640, 480)
+        for serial, verdict, told in (
+            (of.serial, Verdict.GOOD, "as calibrated on"),
+            ("another", Verdict.SHORT, "file"),
+        ):
+            origin = Origin(made=datetime.now(UTC), station=config.name, devices={"camera": serial})
+            made = CameraCalibration(
+                origin=origin, device="camera", camera=place.as_dict(), focal_deviation=1.0, residual_px=0.2, views=9
+            )
+            store.save(store.FOLDER / config.name, made)
+            found = look("reprojection", config, "camera")
+            assert (found.verdict, told in found.measured) == (verdict, True), found
+        (store.FOLDER / config.name / "camera.yaml").write_text("kind: camera\n")
+        assert look("reprojection", config, "camera").verdict is Verdict.SHORT
 
 
 def test_a_tag_that_is_out_of_view_is_named():
