@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,16 +13,16 @@ import numpy as np
 import pytest
 
 from drivers.config import StationConfig
-from drivers.device_host import DeviceHost, make
+from drivers.device_host import make
 from drivers.emulators.franka_arm import FrankaArmEmulator
 from drivers.emulators.mjpeg_camera import MjpegCamera
 from drivers.emulators.netft_box import NetFtBox
 from drivers.real.arm_frames import ArmFrames, PlaneInBase, ToolMount
 from drivers.station import Station
 from drivers.tags import tag_bitmap
-from drivers.wire.station_bus import station_bus
 from experiments.ports import free_endpoint
 from tests.conformance.lab import Lab, WallClock, losing_readings, losing_samples
+from tests.conformance.served import served
 from tests.drivers.real.bubbles import bubble_playback
 
 NAMES = {"arm": "arm", "gripper": "gripper", "force_torque": "wrist_ft", "tag_camera": "camera", "tactile": "gel"}
@@ -141,21 +139,12 @@ def in_process() -> Iterator[Lab]:
 @contextmanager
 def over_zenoh() -> Iterator[Lab]:
     """The backends behind their servers, over the bus; a second client is a second session."""
-    with emulators() as (config, own_time), station_bus(config, "device") as bus, ThreadPoolExecutor(1) as pool:
-        host, ready = DeviceHost(config, bus), threading.Event()
-        serving = pool.submit(host.run, ready.set)
-        serving.add_done_callback(lambda _: ready.set())
-        try:
-            assert ready.wait(60), "the devices are not served"
-            if serving.done():
-                serving.result()
+    with emulators() as (config, own_time), served(config):
 
-            @contextmanager
-            def join() -> Iterator[Lab]:
-                with Station(config).connect() as devices:
-                    yield Lab(devices, devices.clock, None, join, losing_samples, NAMES, ACCURACY, own_time)
+        @contextmanager
+        def join() -> Iterator[Lab]:
+            with Station(config).connect() as devices:
+                yield Lab(devices, devices.clock, None, join, losing_samples, NAMES, ACCURACY, own_time)
 
-            with join() as lab:
-                yield lab
-        finally:
-            host.stop()
+        with join() as lab:
+            yield lab

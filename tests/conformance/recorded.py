@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from drivers.config import StationConfig
-from drivers.device_host import DeviceHost, make
+from drivers.device_host import make
 from drivers.interfaces import Device
 from drivers.sim.host_thread import HostThread
 from drivers.station import Station
-from drivers.wire.station_bus import station_bus
 from experiments.ports import free_endpoint
 from tests.conformance.lab import Lab, WallClock, losing_readings, losing_samples
+from tests.conformance.served import served
 from tests.conformance.simulated import SCENE, station
 
 #: how long the recording is [s], longer than a claim takes on a busy machine; and from a picture to the next
@@ -78,21 +76,12 @@ def in_process() -> Iterator[Lab]:
 @contextmanager
 def over_zenoh() -> Iterator[Lab]:
     """The same behind their servers, over the bus; a second client is a second session."""
-    with recording() as config, station_bus(config, "device") as bus, ThreadPoolExecutor(1) as pool:
-        host, ready = DeviceHost(config, bus), threading.Event()
-        serving = pool.submit(host.run, ready.set)
-        serving.add_done_callback(lambda _: ready.set())
-        try:
-            assert ready.wait(60), "the devices are not served"
-            if serving.done():
-                serving.result()
+    with recording() as config, served(config) as host:
 
-            @contextmanager
-            def join() -> Iterator[Lab]:
-                with Station(config).connect() as devices:
-                    yield Lab(devices, devices.clock, None, join, losing_samples, renew=lambda: rewind(host.devices))
+        @contextmanager
+        def join() -> Iterator[Lab]:
+            with Station(config).connect() as devices:
+                yield Lab(devices, devices.clock, None, join, losing_samples, renew=lambda: rewind(host.devices))
 
-            with join() as lab:
-                yield lab
-        finally:
-            host.stop()
+        with join() as lab:
+            yield lab
