@@ -69,7 +69,7 @@ def maximum_likelihood(samples: Samples, start: Array, terms: bool | tuple[str, 
         _, q, lower = tried[best]
         added, freedom = len(q) - len(p), samples.w.size - len(q) - 3 * samples.drift.shape[1]
         ratio = (cost - lower) / added / (lower / freedom)
-        if fdtrc(added, freedom, ratio) > SIGNIFICANCE:
+        if ratio <= 0 or fdtrc(added, freedom, ratio) > SIGNIFICANCE:
             break
         kept, p, cost = (*kept, best), q, lower
         candidates.remove(best)

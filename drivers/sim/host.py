@@ -205,12 +205,12 @@ class Host:
         """Bring the world up to the present; returns how long to wait for the next piece [s]."""
         simulated = (self.world.now_ns() - self._origin_ns) * 1e-9
         behind = time.monotonic() - self._anchor - simulated
+        piece = _PIECE if self._heard() else _LEISURE
         if behind > self.longest_lag:
             self._anchor += behind
             self.skipped_ns += int(behind * 1e9)
             log.warning("%s: the world was %.0f ms late and gave up the lost time", self.config.name, behind * 1e3)
-            behind = _PIECE  # the sensors speak before anybody hears that so much time has passed
-        piece = _PIECE if behind >= _LEISURE or self._heard() else _LEISURE
+            behind = piece = _PIECE  # the sensors speak before anybody hears that so much time has passed
         if behind < piece:
             return piece - behind
         with self.desk.together():
