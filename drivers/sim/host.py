@@ -41,7 +41,7 @@ from drivers.wire.streams import ViewRates
 PROTOCOL = 2
 TRUTH_PERIOD_NS = 20_000_000
 """Truth is published at 50 Hz of station time; in lockstep urgent work also waits no longer than this."""
-_PIECE, _LEISURE = 0.002, 0.01  # how much real time is simulated at once, and while nobody takes any stream [s]
+_PIECE, _LEISURE = 0.002, 0.02  # how much real time is simulated at once, and while nobody takes any stream [s]
 _IDLE = 0.5
 _LAG = 0.05  # a world that is this late gives up the lost time, well before its readings count as old [s]
 
