@@ -79,9 +79,13 @@ class Lab:
 
     def of(self, kind: str) -> Any:
         """The device of a kind; the claim is not for a backend that has none."""
-        if kind not in self.names:
-            pytest.skip(f"the backend has no {kind}")
-        return self.devices[self.names[kind]]
+        return self.named(self.names.get(kind, kind))
+
+    def named(self, name: str) -> Any:
+        """The device of a name, likewise: a Soft Bubble, say, where its camera's SDK is at hand."""
+        if name not in self.devices:
+            pytest.skip(f"the backend has no {name}")
+        return self.devices[name]
 
     @property
     def world(self) -> Simulation:

@@ -396,9 +396,7 @@ def test_finger_says_which_it_is(lab, name):
 @about("tactile")
 @every_finger
 def test_finger_captures_a_frame_that_was_exposed_after_it_was_asked(lab, name):
-    finger = lab.devices.get(name)
-    if finger is None:
-        pytest.skip("pyrealsense2 or libusb is missing")
+    finger = lab.named(name)
     lab.clock.sleep(0.3)
     for _ in range(2):
         asked = lab.clock.now_ns()
