@@ -306,9 +306,7 @@ class World:
         """The scene's grasp centre in W, about which plans and errors count torques; None where it is the true one."""
         if tuple(plant.coupling.grasp) == self.scene.grasp:
             return None
-        (x, y, theta), (u, v, _) = plant.go.tolist(), self.scene.grasp
-        c, s = float(np.cos(theta)), float(np.sin(theta))
-        return np.array([x + c * u - s * v, y + s * u + c * v])
+        return se2.compose(plant.go, np.array(self.scene.grasp))[:2]
 
     def health(self) -> dict[str, Any]:
         """How well the plant was since the reset: `drivers.sim.health.Health.summary`."""
