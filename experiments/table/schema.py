@@ -120,7 +120,8 @@ class Comparison(_Model):
     """``a`` − ``b`` in a figure, over pairs of trials alike in trajectory and number, for each value of ``each``.
 
     The ``judged`` one of mean, ``upper`` and ``lower`` end of its 95 % interval is held against the target. A target of
-    at most 0 is met by the upper end where a is surely not above b, and by the lower end even where nobody can tell.
+    at most 0 is met by the upper end where a is surely not above b, and by the lower end even where nobody can tell:
+    there the upper end says how far above it could be.
     """
 
     name: str = Field(min_length=1)
