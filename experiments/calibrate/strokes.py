@@ -262,11 +262,15 @@ class Witness(ABC):
 class _Table(Witness):
     """The sensor under the table carries what the object presses on it, as long as nothing is added or taken away."""
 
+    def __init__(self, rig: Rig, sensor: ForceTorqueSensor):
+        super().__init__(rig, sensor)
+        self._angle = float(sensor.describe().extra["pose"][2])
+
     def force(self, reading: Array, X_W_ee: Array) -> Array:
         return -se2.rotate(self.angle(X_W_ee), TaskPlane().wrench_to_planar(reading)[:2])
 
     def angle(self, X_W_ee: Array) -> float:
-        return float(self.sensor.describe().extra["pose"][2])
+        return self._angle
 
 
 class _Wrist(Witness):
