@@ -115,10 +115,12 @@ class Trial:
         go_air = self._lifted(self._nominal)
         mover.go_above(self._nominal.free_air_ee(go_air))
         self._settle()
-        plan = self._anchored(go_air)
+        plan, X_W_eo = self._anchored(go_air)
         self._result.plan = plan
         controller = self._make_controller(plan)
         monitor = ContactMonitor(plan, s.slip_tolerance_mm * 1e-3, s.force_limit)
+        if X_W_eo is not None:
+            monitor.before_touch(X_W_eo)
 
         go_air = self._lifted(plan)
         ee_air = plan.free_air_ee(go_air)
@@ -238,10 +240,10 @@ class Trial:
             if np.hypot(*(controller.correction - before)[:2]) < 2e-5:
                 break
 
-    def _anchored(self, go_expected: Array) -> Plan:
+    def _anchored(self, go_expected: Array) -> tuple[Plan, Array | None]:
         """Verify the start by tags, zero the wrist sensor under the go's weight, and anchor the plan.
 
-        It is anchored to the table and, along it, to the extrinsic object.
+        It is anchored to the table and, along it, to the extrinsic object, whose pose in W (3,) is told with it.
         """
         bodies = ("table", "go") if self._nominal.eo is None else ("table", "go", "eo")
         if not self._observer.tags.get("go"):
@@ -259,7 +261,8 @@ class Trial:
         table, go, eo = (seen.get(body) for body in ("table", "go", "eo"))
         assert table is not None  # _start_problem saw it
         self._zero(go, go_expected)
-        return anchored(self._nominal, table.pose, None if eo is None else eo.pose)
+        X_W_eo = None if eo is None else eo.pose
+        return anchored(self._nominal, table.pose, X_W_eo), X_W_eo
 
     def _zero(self, seen: TagPose | None, go_expected: Array) -> None:
         """Zero the force sensors in free air, under the weight of a go where its tag was seen, else where it should be.

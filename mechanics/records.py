@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from mechanics.readings import Array
 
 
@@ -18,6 +20,12 @@ class PlanarState:
     go: Array | None
     eo: Array | None
     wrench: Array
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all that is there is numbers."""
+        there = [value for value in (self.ee, self.go, self.eo, self.wrench) if value is not None]
+        return bool(np.isfinite(np.concatenate(there)).all())
 
 
 @dataclass(frozen=True, slots=True)
