@@ -6,7 +6,7 @@ Every trial of every skill and controller runs through here, on the simulated st
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -141,7 +141,7 @@ class Trial:
         steps = len(plan.ee)
         for k in range(steps):
             self._watch.phase("trajectory", k / steps)
-            measured, commanded, estimated, contact = self._visit(controller, plan, k)
+            measured, commanded, estimated, contact = self._visit(controller, plan, monitor, k)
             planned = PlanarState(plan.ee[k], plan.go[k], None if plan.eo is None else plan.eo[k], plan.wrench[k])
             record = WaypointRecord(
                 self._clock.now_ns(), self._name, k, planned, commanded, measured, None, estimated, contact
@@ -162,9 +162,11 @@ class Trial:
         self._watch.phase("done", 1.0)
 
     def _visit(
-        self, controller: Controller, plan: Plan, k: int
+        self, controller: Controller, plan: Plan, monitor: ContactMonitor, k: int
     ) -> tuple[PlanarState, Array, PlanarState | None, ContactBelief | None]:
         """Go to waypoint ``k``, let the controller correct it, and measure once settled.
+
+        What has slipped is not corrected before the law was asked about it: it would be followed wherever it has gone.
 
         What slips is moved on, never about: there an update acts in the motion to the next waypoint. A small motion
         back would leave the contact stuck with less friction than it slips with, and several times as stiff.
@@ -175,17 +177,25 @@ class Trial:
         updates = s.corrections if controller.feedback else 0
         later = slips(plan)
         for _ in range(0 if later else updates):
-            controller.in_contact(k, self._estimate())
+            told = self._estimate()
+            # the monitor goes by tags: a go that is felt lies elsewhere by what fingers and tags disagree in
+            if self._slid(monitor, k, replace(told, go=None) if self._observer.fingers else told):
+                break
+            controller.in_contact(k, told)
             self._tell_slip()
             mover.ramp(controller.waypoint(k), s.ramp)
             self._settle()
         estimated = self._estimate() if self._observer.fingers else None
         measured = self._observer.measure()
-        if later and updates:
+        if later and updates and not self._slid(monitor, k, measured):
             controller.in_contact(k, measured if estimated is None else estimated)
             self._tell_slip()
         self._hear_witness(k, measured)
         return measured, mover.pose, estimated, self._observer.contact()
+
+    def _slid(self, monitor: ContactMonitor, k: int, seen: PlanarState) -> bool:
+        """Whether a contact is ``seen`` to have slipped, and nobody has decided about it yet."""
+        return self._result.deviation is None and monitor.has_slipped(k, seen)
 
     def _taken_in(self, found: Deviation, controller: Controller, told: PlanarState) -> bool:
         """Whether the law, asked with what it is ``told`` of this instant, goes on. After a refusal nobody asks."""

@@ -131,6 +131,24 @@ def test_a_law_is_not_asked_about_a_stop():
     assert kept["law"].asked == []
 
 
+def test_a_law_is_asked_about_a_slip_before_it_corrects_where_that_went():
+    calls = []
+
+    class Asked(ClosedLoop):
+        def in_contact(self, step, measured):
+            calls.append((step, "corrects"))
+
+        def replan(self, step, measured, deviation):
+            calls.append((step, "is asked"))
+            return True
+
+    result = Slippery("stages.0.parameters.steps=5").run(Asked, slip_tolerance_mm=0.1)
+    assert result.status == "completed"
+    asked = {step for step, what in calls if what == "is asked"}
+    assert len(asked) >= 2
+    assert calls == [(step, "is asked" if step in asked else "corrects") for step in range(5)]
+
+
 def test_an_object_that_slides_while_it_is_loaded_ends_the_trial_at_the_first_waypoint():
     station = Station()
     resting = np.array([0.1, 0.03, 0.0])
