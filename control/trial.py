@@ -18,6 +18,7 @@ from control.observe import Observer
 from control.settings import TrialSettings
 from drivers.errors import CommandRefused, DriverError, SimulationDiverged
 from drivers.interfaces import Clock
+from estimation.finger_slip import Drift
 from estimation.force_torque import FreeAirLoad
 from estimation.tag_pose import TagPose
 from estimation.tool_identification import Agreement
@@ -32,7 +33,9 @@ class TrialResult:
     """How a trial ended (statuses of design §6) and what it recorded. ``plan`` is the plan as anchored.
 
     ``witness`` is what the sensor under the table said of the wrist's force, at the waypoints where it said anything.
-    ``deviation`` is the first that the law did not take in.
+    ``drifts`` tell how the object lay in the fingers at the waypoints, by number, where that was seen, and
+    ``finger_slip`` what was said of it when it had slipped there. ``deviation`` is the first that the law did not take
+    in.
     """
 
     status: str
@@ -40,6 +43,8 @@ class TrialResult:
     plan: Plan
     waypoints: list[WaypointRecord] = field(default_factory=list)
     witness: list[Agreement] = field(default_factory=list)
+    drifts: dict[int, Drift] = field(default_factory=dict)
+    finger_slip: str = ""
     deviation: Deviation | None = None
 
 
@@ -50,8 +55,8 @@ class Watch:
     waypoint: Callable[[WaypointRecord], None] = lambda _waypoint: None
     phase: Callable[[str, float], None] = lambda _name, _fraction: None
     event: Callable[[str, str], None] = lambda _level, _text: None
-    #: what the fingers tell, each time they are asked
-    estimate: Callable[[PlanarState], None] = lambda _state: None
+    #: the wrench (3,) on the grasped object that its place in the fingers tells, axes of W, each time it is seen
+    felt: Callable[[Array], None] = lambda _wrench: None
     #: once per set-point; whatever it raises ends the trial
     tick: Callable[[], None] = lambda: None
     #: asks a person to reset the scene and says whether they did; a station without a person answers False
@@ -82,7 +87,7 @@ class Trial:
         self._observer, self._clock, self._load = observer, clock, load
         self._settings, self._watch = settings, watch
         self._result = TrialResult("completed", "", plan)
-        self._slip_told = self._witness_told = False
+        self._witness_told = False
         self._mover = Mover.of(observer.arm, clock, observer.arm_pose(), settings, watch.tick)
 
     def run(self) -> TrialResult:
@@ -182,15 +187,14 @@ class Trial:
             if self._slid(monitor, k, replace(told, go=None) if self._observer.fingers else told):
                 break
             controller.in_contact(k, told)
-            self._tell_slip()
             mover.ramp(controller.waypoint(k), s.ramp)
             self._settle()
         estimated = self._estimate() if self._observer.fingers else None
         measured = self._observer.measure()
         if later and updates and not self._slid(monitor, k, measured):
             controller.in_contact(k, measured if estimated is None else estimated)
-            self._tell_slip()
-        self._hear_witness(k, measured)
+        agreed = self._hear_witness(k, measured)
+        self._hear_grasp(k, agreed)
         return measured, mover.pose, estimated, self._observer.contact()
 
     def _slid(self, monitor: ContactMonitor, k: int, seen: PlanarState) -> bool:
@@ -217,10 +221,11 @@ class Trial:
             result.status, result.reason = found.status, found.reason
             self._watch.event("warning", f"{found.reason}; the trial goes on")
 
-    def _hear_witness(self, k: int, measured: PlanarState) -> None:
+    def _hear_witness(self, k: int, measured: PlanarState) -> bool:
+        """Whether the sensor under the table has nothing against the wrist's force. The first that it has is told."""
         found = self._observer.second_opinion(measured)
         if found is None:
-            return
+            return True
         self._result.witness.append(found)
         if not found.agrees and not self._witness_told:
             self._witness_told = True
@@ -230,16 +235,32 @@ class Trial:
                 f"waypoint {k}: the wrist's force and the one under the table differ by ({dx:+.2f}, {dy:+.2f}) N, more "
                 f"than their errors allow: check both sensors, and what touches the table besides the objects",
             )
+        return found.agrees
 
     def _estimate(self) -> PlanarState:
         state = self._observer.estimate()
-        self._watch.estimate(state)
+        self._tell_felt()
         return state
 
-    def _tell_slip(self) -> None:
-        if self._observer.slip and not self._slip_told:
-            self._slip_told = True
-            self._watch.event("warning", self._observer.slip)
+    def _tell_felt(self) -> None:
+        if self._observer.drift is not None:
+            self._watch.felt(self._observer.drift.wrench)
+
+    def _hear_grasp(self, k: int, trusted: bool) -> None:
+        """Keep how the object lies in the fingers at a settled waypoint; the first slip there is told.
+
+        Without a wrist that is ``trusted`` a slip is not told from a force that nobody has measured.
+        """
+        self._tell_felt()
+        drift, result, said = self._observer.drift, self._result, self._observer.slip
+        if drift is not None:
+            result.drifts[k] = drift
+            if drift.slipped and trusted:
+                said = f"the object has slipped in the fingers by {drift.size_mm:.1f} mm and {drift.size_deg:.1f} deg"
+        if said and not result.finger_slip:
+            result.finger_slip = f"waypoint {k}: {said}"
+            advice = "grip it harder, or press less; where it has not moved, check the wrist's sensor"
+            self._watch.event("warning", f"{result.finger_slip}: {advice}")
 
     def _converge_in_air(self, controller: Controller, go: Array, ee: Array) -> None:
         for _ in range(self._settings.air_corrections):
@@ -279,7 +300,7 @@ class Trial:
 
         Once for what is estimated in air, and again just before touch-down: a sensor's zero walks meanwhile.
         """
-        self._observer.zero(self._load, go_expected if seen is None else seen.pose)
+        self._observer.zero(self._load, go_expected if seen is None else seen.pose, seen=seen is not None)
 
     def _start_problem(self, seen: dict, go_expected: Array) -> str | None:
         for body, pose in seen.items():
