@@ -72,6 +72,7 @@ class Observer:
     _seen: dict[str, tuple[int, TagPose]] = field(default_factory=dict)
     _looking: bool = False
     _told: PlanarState | None = None
+    _known: State | None = None
 
     def __post_init__(self) -> None:
         # one that goes by the go's tag, and one by what the fingers feel
@@ -177,8 +178,7 @@ class Observer:
                 "See to the fingers and the grasp, or take the pose from tags: --set trial.go_pose=tags",
             )
         self.felt = now
-        on_go = wrench.about(now.wrench, now.centre, se2.compose(now.go, self.grasp)[:2])
-        self._told = PlanarState(now.ee, now.go, None if extrinsic is None else extrinsic.pose, on_go)
+        self._told = self._planar(now, None if extrinsic is None else extrinsic.pose)
         self.drift = None if self._by_touch is None else self._by_touch.drift(self._told, now.go_covariance)
         return self._told
 
@@ -208,6 +208,11 @@ class Observer:
         if seen is not None:
             state.push_tag(body, *seen)
 
+    def _planar(self, now: State, eo: Array | None) -> PlanarState:
+        """A whole state as plans and `measure` have it: the wrench about the planned grasp centre on the go."""
+        on_go = wrench.about(now.wrench, now.centre, se2.compose(now.go, self.grasp)[:2])
+        return PlanarState(now.ee, now.go, eo, on_go)
+
     def state_now(self) -> State | None:
         """The whole state at a settled instant, after `measure`; None without a ``state`` estimator.
 
@@ -223,12 +228,22 @@ class Observer:
     def contact(self) -> ContactBelief | None:
         """Where the go is believed to be touched, of `state_now`; None where nobody looks for it."""
         with self._look("contact"):
-            now = self.state_now()
+            self._known = now = self.state_now()
         if now is None or now.contact is None:
             return None
         found = now.contact.hypotheses
         points = np.array([one.point for one in found]).reshape(-1, 2)
         return ContactBelief(now.contact.status.value, points, np.array([one.weight for one in found]))
+
+    @property
+    def estimated(self) -> PlanarState | None:
+        """The state behind the newest `contact`, which takes no look of its own; None without a ``state`` estimator.
+
+        From the fingers where there are some, as `estimate` told it, else from arm, wrist, tags and elasticity.
+        """
+        if self.fingers or self._known is None:
+            return self._told
+        return self._planar(self._known, self._known.eo)
 
     def second_opinion(self, measured: PlanarState) -> Agreement | None:
         """What the sensor under the table says of the wrench in ``measured``; None where it says nothing."""

@@ -146,16 +146,24 @@ class Trial:
         steps = len(plan.ee)
         for k in range(steps):
             self._watch.phase("trajectory", k / steps)
-            measured, commanded, estimated, contact = self._visit(controller, plan, monitor, k)
+            measured, told, commanded, contact = self._visit(controller, plan, monitor, k)
             planned = PlanarState(plan.ee[k], plan.go[k], None if plan.eo is None else plan.eo[k], plan.wrench[k])
             record = WaypointRecord(
-                self._clock.now_ns(), self._name, k, planned, commanded, measured, None, estimated, contact
+                self._clock.now_ns(),
+                self._name,
+                k,
+                planned,
+                commanded,
+                measured,
+                None,
+                self._observer.estimated,
+                contact,
             )
             self._result.waypoints.append(record)
             self._watch.waypoint(record)
             deviation = monitor.check(k, measured, weight)
             if deviation is not None:
-                if self._taken_in(deviation, controller, measured if estimated is None else estimated):
+                if self._taken_in(deviation, controller, told):
                     monitor.restart(k, measured)
                 else:
                     self._deviates(deviation)
@@ -168,8 +176,10 @@ class Trial:
 
     def _visit(
         self, controller: Controller, plan: Plan, monitor: ContactMonitor, k: int
-    ) -> tuple[PlanarState, Array, PlanarState | None, ContactBelief | None]:
+    ) -> tuple[PlanarState, PlanarState, Array, ContactBelief | None]:
         """Go to waypoint ``k``, let the controller correct it, and measure once settled.
+
+        What is measured, what a law is told there, the pose commanded, and where the go is believed to be touched.
 
         What has slipped is not corrected before the law was asked about it: it would be followed wherever it has gone.
 
@@ -191,11 +201,12 @@ class Trial:
             self._settle()
         estimated = self._estimate() if self._observer.fingers else None
         measured = self._observer.measure()
+        told = measured if estimated is None else estimated
         if later and updates and not self._slid(monitor, k, measured):
-            controller.in_contact(k, measured if estimated is None else estimated)
+            controller.in_contact(k, told)
         agreed = self._hear_witness(k, measured)
         self._hear_grasp(k, agreed)
-        return measured, mover.pose, estimated, self._observer.contact()
+        return measured, told, mover.pose, self._observer.contact()
 
     def _slid(self, monitor: ContactMonitor, k: int, seen: PlanarState) -> bool:
         """Whether a contact is ``seen`` to have slipped, and nobody has decided about it yet."""

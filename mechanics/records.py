@@ -50,9 +50,10 @@ class ContactBelief:
 class WaypointRecord:
     """One settled waypoint of a trial: planned (anchored to the table), commanded ee pose, measured, and true.
 
-    ``estimated`` is what the controller was told of this instant, where it asks for more than what is measured (from
-    the tactile images, say), ``contact`` where the go was believed to be touched. ``truth`` is the plant's own state,
-    filled in by the runner in simulation only.
+    ``estimated`` is the whole state as estimated at this instant: from the fingers, as the controller was told, where
+    it feels; else from arm, wrist, tags and elasticity, and a controller was told what is ``measured``. ``contact`` is
+    where the go was believed to be touched. ``truth`` is the plant's own state, filled in by the runner in simulation
+    only.
     """
 
     capture_ns: int

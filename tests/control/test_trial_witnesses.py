@@ -93,6 +93,35 @@ def test_a_silent_sensor_under_the_table_is_no_witness_and_no_failure():
     assert result.witness == []
 
 
+# -- the whole state ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", [OpenLoop, ClosedLoop])
+def test_the_state_is_estimated_at_every_waypoint_under_any_law_and_takes_no_picture_more(law):
+    station, truths, pictures = Station(), [], []
+    camera = station.devices["camera"]
+    capture = camera.capture
+    camera.capture = lambda *given: pictures.append(1) or capture(*given)
+
+    class Waypoints(list):
+        def append(self, record):
+            super().append(record)
+            truths.append(station.world.truth())
+
+    station.waypoints = Waypoints()
+    station.run(law, observer=whole_observer(station))
+    for waypoint, truth in zip(station.waypoints, truths, strict=True):
+        told = waypoint.estimated
+        assert told is not None
+        assert told.ee == pytest.approx(truth.ee, abs=1e-5)
+        assert told.go == pytest.approx(truth.go, abs=1e-4)
+        assert told.wrench == pytest.approx(truth.wrench, abs=0.02)
+    # table and object before the start, the object before touch-down, and one look for each measurement
+    looks = {OpenLoop: STEPS, ClosedLoop: 2 * STEPS}[law]
+    in_air = len(pictures) - looks - 2
+    assert in_air == 0 if law is OpenLoop else 0 < in_air <= TrialSettings().air_corrections
+
+
 # -- how the object lies in the fingers --------------------------------------------------------------------------------
 
 
