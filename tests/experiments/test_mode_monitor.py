@@ -112,6 +112,7 @@ def test_no_trial_that_keeps_its_modes_is_ended_in_the_lab(command, experiment):
         command.start_run(
             experiment, "--set", "world.profile=lab", "--set", "stages.1.controllers=[closed_loop]", out=experiment
         ),
+        experiment,
         timeout=400,
     )
     assert run.code == 0, run.trial("closed_loop")["reason"]
