@@ -13,6 +13,7 @@ from control.motion import PEAK
 from drivers.config import ArmConfig, ForceTorqueConfig, TactileConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
+from experiments import disk
 from experiments.calibrate.schema import CameraStage, FrictionStage
 from experiments.calibrate.store import Calibrations, load
 from experiments.faults.schema import FaultsStage
@@ -47,6 +48,7 @@ def check(
     problems = _device_problems(resolved) + _scene_problems(resolved)
     if problems:
         raise InputError(problems)
+    disk.require_store(resolved)
     made = tasks(resolved, believed(resolved, calibrations), feasible)
     plans = plan_files(resolved, own)
     problems = [

@@ -50,15 +50,15 @@ class Suspender:
     def has_come_back(self, device: str) -> bool:
         """Whether the ``device`` that cut a trial off is well, as all others are, at once or within the limit.
 
-        An arm is not waited for: it was let go where it was, and a person looks before it moves.
+        An arm is not waited for: it was let go where it was, and a person looks before it moves. Nor is what is no
+        device of the station, such as the disk.
         """
-        if self._how.on_fault != "pause" or any(
-            isinstance(d, Arm) and d.name == device for d in self._devices.values()
-        ):
+        sensors = {known.name for known in self._devices.values() if not isinstance(known, Arm)}
+        if self._how.on_fault != "pause" or not sensors.issuperset(device.split(", ")):
             return False
         waited, left = self._wait()
         if not left:
-            when = f"the devices are well again after {waited:.3g} s" if waited else f"{device or 'all'} is well again"
+            when = f"the devices are well again after {waited:.3g} s" if waited else f"{device} is well again"
             self._context.event("info", f"{when}: the trial is run again")
         return not left
 
