@@ -7,8 +7,8 @@
     pivoting = run("grasped_pivoting", set={"world.profile": "lab"})
     pivoting.trials[["controller", "status", "measured.wrench_N.mean"]]
 
-Bad input raises `mechanics.yaml_input.InputError`, a task without a plan `planning.errors.InfeasiblePlan`, both before
-anything was started, with the command's own words. A run that could not be carried out raises `RunFailed`.
+Bad input raises `mechanics.yaml_input.InputError`, before anything was started and with the command's own words; a run
+that could not be carried out raises `RunFailed`.
 """
 
 from __future__ import annotations
