@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from experiments import kernels
-from experiments.command import Sets, StationName, commands
+from experiments.command import JsonFile, Sets, StationName, commands
 from experiments.exit_codes import ExitCode
 from experiments.lab.commands import app as lab
+from experiments.terminal import prepare, terminal
 
 app = typer.Typer(
     name="extrinsic",
@@ -69,16 +69,16 @@ def run(
     chosen += [] if speed is None else [f"trial.speed={speed:g}"]
     if resume is not None:
         refuse_besides({"--set": sets, "--out": out, "--rehearse": rehearse, "--speed": speed})
-        outcome = go_on(resume, experiment, station, Console(stderr=True))
+        outcome = go_on(resume, experiment, station, terminal(stderr=True))
     elif experiment is None:
         raise InputError([Problem("run", None, "EXPERIMENT", "it is missing", "an experiment, or --resume RUN")])
     else:
-        outcome = runner.run(load(experiment, station, chosen), out, Console(stderr=True))
-    console = Console()
+        outcome = runner.run(load(experiment, station, chosen), out, terminal(stderr=True))
+    console = terminal()
     faults = outcome.results.get("faults")
     console.print("", faults_table(faults) if faults else error_table(outcome.results), "", sep="\n")
     if outcome.exit_code is not ExitCode.DONE:
-        Console(stderr=True, soft_wrap=True).print(f"[red]{outcome.results['status']}[/]: {outcome.reason}")
+        terminal(stderr=True, prose=True).print(f"[red]{outcome.results['status']}[/]: {outcome.reason}")
     console.print(f"report: {outcome.folder.report}", soft_wrap=True, highlight=False)
     raise typer.Exit(outcome.exit_code)
 
@@ -89,7 +89,7 @@ def check(experiment: Experiment, station: StationOption = None, sets: Sets = No
     from experiments.check import check as dry_run
     from experiments.files import load
 
-    console = Console()
+    console = terminal()
     for line in dry_run(load(experiment, station, sets or [])):
         console.print(line, soft_wrap=True, highlight=False)
 
@@ -121,17 +121,30 @@ def emulate(station: StationName, sets: Sets = None) -> None:
     raise typer.Exit(emulate_lab(load_station(station, sets or [])))
 
 
-@command("extrinsic status sim")
-def status(station: StationName, sets: Sets = None) -> None:
-    """Show every device of a station: alive, rate, age, faults."""
-    from drivers.status import station_certificates, station_status
+@command("extrinsic status sim --watch")
+def status(
+    station: StationName,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Go on showing it until q or Ctrl-C; a plain line per device in a file.")
+    ] = False,
+    interval: Annotated[
+        float | None,
+        typer.Option(
+            "--interval", metavar="SECONDS", min=0.1, max=3600, help="How often --watch shows it: 0.5; 10 in a file."
+        ),
+    ] = None,
+    json_file: JsonFile = None,
+    sets: Sets = None,
+) -> None:
+    """Show every device of a station: alive, rate, age, lost readings, who commands it, what stopped it."""
+    from experiments import status as telling
     from experiments.files import load_station
-    from experiments.tables import status_table
+    from mechanics.yaml_input import InputError, Problem
 
     config = load_station(station, sets or [])
-    rows = station_status(config)
-    Console().print(status_table(rows, station_certificates(config)))
-    raise typer.Exit(ExitCode.DONE if all(row.alive for row in rows) else ExitCode.DEVICE_FAILED)
+    if not watch and interval is not None:
+        raise InputError([Problem("status", None, "--interval", "there is one look without --watch", "--watch")])
+    raise typer.Exit(telling.watch(config, interval, json_file) if watch else telling.once(config, json_file))
 
 
 @command("extrinsic stop sim")
@@ -141,7 +154,7 @@ def stop(station: StationName, sets: Sets = None) -> None:
     from experiments.files import load_station
 
     for arm in stop_arms(load_station(station, sets or [])):
-        Console().print(f"{arm.name} is stopped: {arm.reason}", soft_wrap=True, highlight=False)
+        terminal().print(f"{arm.name} is stopped: {arm.reason}", soft_wrap=True, highlight=False)
 
 
 @command("extrinsic recover sim")
@@ -152,7 +165,7 @@ def recover(station: StationName, sets: Sets = None) -> None:
 
     for arm in recover_arms(load_station(station, sets or [])):
         said = f"was stopped: {arm.reason}; it takes set-points again" if arm.reason else "was not stopped"
-        Console().print(f"{arm.name} {said}", soft_wrap=True, highlight=False)
+        terminal().print(f"{arm.name} {said}", soft_wrap=True, highlight=False)
 
 
 @command("extrinsic check-device lab1.yaml wrist_ft", name="check-device")
@@ -170,9 +183,7 @@ def check_device(
     yes: Annotated[
         bool, typer.Option("--yes", help="Ask nobody: agree to what is asked for, leave out what needs a hand.")
     ] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the findings as JSON.")
-    ] = None,
+    json_file: JsonFile = None,
     sets: Sets = None,
 ) -> None:
     """Walk through the bring-up of one device: what to look at, what is measured, what it is worth."""
@@ -181,7 +192,7 @@ def check_device(
     from experiments.files import load_station
 
     load_station(station, sets or [], [device])  # refuses one that the station has not
-    config, console = load_station(station, sets or []), Console()
+    config, console = load_station(station, sets or []), terminal()
     person = whoever_is_here(console, yes=yes)
     steps = tuple(step or ())
     code = walk_through(
@@ -200,7 +211,7 @@ def report(
 
     folder = RunFolder.open(run_folder)
     build_report(folder)
-    Console().print(f"report: {folder.report}", soft_wrap=True, highlight=False)
+    terminal().print(f"report: {folder.report}", soft_wrap=True, highlight=False)
 
 
 @command("extrinsic repair runs/grasped_pivoting-20260101T120000.000000")
@@ -210,22 +221,20 @@ def repair(
     """Mend a log that was cut off, beside it; rebuild results.json and the report."""
     from experiments import repair as mending
 
-    mending.say(mending.repair(run_folder), Console())
+    mending.say(mending.repair(run_folder), terminal())
 
 
 @command("extrinsic replay runs/grasped_pivoting-20260101T120000.000000 --check")
 def replay(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the estimates as JSON.")
-    ] = None,
+    json_file: JsonFile = None,
     check_same: Annotated[bool, typer.Option("--check", help="Exit with 1 when an estimate differs.")] = False,
 ) -> None:
     """Estimate a recorded run again, from its log, with the code of today; show what differs."""
     from experiments import replay as replaying
     from experiments.run_folder import RunFolder
 
-    raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, Console()))
+    raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, terminal()))
 
 
 @command("extrinsic bench sim --check")
@@ -235,7 +244,7 @@ def bench(
         int | None,
         typer.Option("--runs", min=1, help="Measurements per figure of sim, estimation, planning; 5."),
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
+    json_file: JsonFile = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write BENCHMARK.json into DIR.")] = None,
     check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
     horizons: Annotated[
@@ -278,7 +287,7 @@ def sweep(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="The sweep's folder; one that was cut off goes on.")
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the summary as JSON.")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Run every combination of a grid, every seed and trial, on workers; one table of all trials."""
     from experiments.campaign.sweep import sweep as run_sweep
@@ -298,8 +307,8 @@ def sweep(
         retries=retries,
         out=out,
         json_file=json_file,
-        console=Console(),
-        said=Console(stderr=True),
+        console=terminal(),
+        said=terminal(stderr=True),
     )
     raise typer.Exit(code)
 
@@ -335,9 +344,7 @@ def table(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="The table's folder; one begun goes on.")
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write table.json there, too.")
-    ] = None,
+    json_file: JsonFile = None,
     check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
 ) -> None:
     """Run a table of the paper: calibrate, run its trials, print our figures beside the paper's."""
@@ -366,6 +373,7 @@ def _check_packages() -> str | None:
 
 def main() -> None:
     """Entry point."""
+    prepare()
     problem = _check_packages()
     if problem:
         sys.exit(f"extrinsic: {problem}")

@@ -42,6 +42,7 @@ from experiments.results_file import BEGUN, Begun
 from experiments.run_folder import RunFolder, write_atomic, write_json
 from experiments.run_lock import RunLock
 from experiments.stages import STAGES, has_diverged, skip_stages
+from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem
 from planning.errors import InfeasiblePlan
 
@@ -113,7 +114,7 @@ def carry_out(
     host: Hosting = HostProcess,
 ) -> Outcome:
     """Run what ``results`` do not have yet, into ``folder``, whose lock is held; however it ends, it returns."""
-    console = console or Console(stderr=True)
+    console = console or terminal(stderr=True)
     outlive_terminal(console)
     _keep_what_is_here()
     code, reason = ExitCode.DONE, ""

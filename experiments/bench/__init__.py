@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from experiments.bench import figures
 from experiments.exit_codes import ExitCode
 from experiments.progress import Progress
 from experiments.run_folder import write_json
+from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem, nearest, one_of
 
 #: columns of a table that goes to a file or a pipe
@@ -105,13 +103,13 @@ def main(name: str, options: Options, json_file: Path | None, out: Path | None, 
             having = " or ".join(f"bench {other}" for other in HAVE[option])
             raise InputError([Problem("bench", None, f"--{option}", f"{name} has no {option}", having)])
     targets = figures.targets_of(name)
-    said = Console(stderr=True)
+    said = terminal(stderr=True)
     measured: list[figures.Figure] = []
     with Progress(said).step(f"bench {name}"):
         for figure in BENCHMARKS[name](options):
             measured.append(figure)
             said.print(f"{figure.name}: {figure.median:.3g} {figure.unit}", highlight=False, markup=False)
-    console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else FILE_WIDTH)
+    console = terminal(file_width=FILE_WIDTH)
     console.print(figures.table(f"bench {name}", measured, targets))
     if name in TABLES:
         console.print(TABLES[name](measured))

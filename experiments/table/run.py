@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from rich.console import Console
 
 from experiments.bench.figures import TARGETS, Target, Targets
 from experiments.exit_codes import ExitCode
@@ -21,6 +18,7 @@ from experiments.table import aggregate, jobs, render
 from experiments.table.jobs import Options
 from experiments.table.measure import CalibrationFailed, Engine, measure
 from experiments.table.schema import Table
+from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem, parse, read_yaml
 
 #: columns of a table that goes to a file or a pipe
@@ -38,7 +36,7 @@ def main(
     """Make a table and show it. Raises InputError and InfeasiblePlan before anything is started."""
     table, sets = jobs.load_table(name, options.sets)
     options = Options(options.seed, options.trials, options.runs, sets)
-    said = Console(stderr=True)
+    said = terminal(stderr=True)
     folder = (out or Path("runs") / f"table_{table.name}-{datetime.now(UTC):%Y%m%dT%H%M%S.%f}").absolute()
     try:
         data = measure(table, options, engine, folder, said)
@@ -47,7 +45,7 @@ def main(
         return ExitCode.DEVICE_FAILED if error.status in ("failed", "device_failed") else ExitCode.FELL_SHORT
     result = {**stated(table, options, data), "calibrations": believed(folder)}
     keep(folder, result, data, json_file)
-    console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else FILE_WIDTH)
+    console = terminal(file_width=FILE_WIDTH)
     render.show(console, result)
     console.print(f"table: {folder / 'table.md'}", soft_wrap=True, highlight=False)
     for line in result["shortfalls"] if check else []:
