@@ -15,10 +15,10 @@ from typing import Any
 from drivers.config import StationConfig
 from drivers.errors import DriverError
 from drivers.health import WORDS
-from drivers.station import listening
 from drivers.wire.client import REMOTES, RemoteArm
 from drivers.wire.link import Link
 from drivers.wire.remote import RemoteSensor
+from drivers.wire.session import listening
 from drivers.wire.station_bus import certificates, station_bus
 from mechanics.readings import Status
 

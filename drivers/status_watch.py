@@ -20,11 +20,11 @@ from drivers.config import StationConfig
 from drivers.errors import DriverError
 from drivers.health import WORDS
 from drivers.interfaces import Description
-from drivers.station import listening
 from drivers.status import Commanding, DeviceStatus, absent, explained, nothing_listens
 from drivers.wire import topics
 from drivers.wire.bus import Bus
 from drivers.wire.link import Link
+from drivers.wire.session import listening
 from drivers.wire.station_bus import station_bus
 from drivers.wire.streams import Sample
 from drivers.wire.watch import Watch

@@ -8,10 +8,24 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
-from experiments import kernels
-from experiments.command import JsonFile, Sets, StationName, commands
+from experiments import completion, kernels
+from experiments.command import (
+    Benchmark,
+    CheckTargets,
+    Experiment,
+    JsonFile,
+    Run,
+    Scheduler,
+    Sets,
+    StationName,
+    StationOption,
+    TableName,
+    commands,
+)
 from experiments.exit_codes import ExitCode
+from experiments.json_output import beside
 from experiments.lab.commands import app as lab
 from experiments.terminal import prepare, terminal
 
@@ -28,19 +42,15 @@ app = typer.Typer(
 command = commands(app)
 app.add_typer(lab)
 
-Experiment = Annotated[str, typer.Argument(metavar="EXPERIMENT", help="An experiment file, or a shipped one's name.")]
-StationOption = Annotated[
-    str | None,
-    typer.Option("--station", metavar="STATION", help="Run on this station, not the experiment's own."),
-]
-
 
 @command("extrinsic run grasped_pivoting --set world.stiffness_scale=0.8")
 def run(
     experiment: Annotated[
         str | None,
         typer.Argument(
-            metavar="[EXPERIMENT]", help="An experiment file, or a shipped one's name; may be left out with --resume."
+            metavar="EXPERIMENT",
+            help="An experiment file, or a shipped one's name; may be left out with --resume.",
+            autocompletion=completion.experiments,
         ),
     ] = None,
     station: StationOption = None,
@@ -54,7 +64,12 @@ def run(
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option("--resume", metavar="RUN", help="Go on with the run in this folder where it was cut off."),
+        typer.Option(
+            "--resume",
+            metavar="RUN",
+            help="Go on with the run in this folder where it was cut off.",
+            autocompletion=completion.runs,
+        ),
     ] = None,
 ) -> None:
     """Run an experiment: plan, execute, log, measure, report."""
@@ -78,27 +93,32 @@ def run(
     faults = outcome.results.get("faults")
     console.print("", faults_table(faults) if faults else error_table(outcome.results), "", sep="\n")
     if outcome.exit_code is not ExitCode.DONE:
-        terminal(stderr=True, prose=True).print(f"[red]{outcome.results['status']}[/]: {outcome.reason}")
+        said = terminal(stderr=True, prose=True)
+        said.print(f"[red]{outcome.results['status']}[/]: {escape(outcome.reason)}")
+        for line in runner.what_next(outcome):
+            said.print(line, markup=False)
     console.print(f"report: {outcome.folder.report}", soft_wrap=True, highlight=False)
     raise typer.Exit(outcome.exit_code)
 
 
 @command("extrinsic check experiments/grasped_static.yaml --station sim")
-def check(experiment: Experiment, station: StationOption = None, sets: Sets = None) -> None:
+def check(experiment: Experiment, station: StationOption = None, sets: Sets = None, json_file: JsonFile = None) -> None:
     """Validate and resolve an experiment and dry-run its sequence; touches no device."""
-    from experiments.check import check as dry_run
-    from experiments.files import load
+    from experiments.check import main as dry_run
 
-    console = terminal()
-    for line in dry_run(load(experiment, station, sets or [])):
-        console.print(line, soft_wrap=True, highlight=False)
+    dry_run(experiment, station, sets or [], json_file)
 
 
 @command("extrinsic serve sim --set world.clock=realtime")
 def serve(
     station: StationName,
     devices: Annotated[
-        list[str] | None, typer.Argument(metavar="[DEVICE]...", help="Serve only these devices; all by default.")
+        list[str] | None,
+        typer.Argument(
+            metavar="DEVICE",
+            help="Serve only these devices; all by default.",
+            autocompletion=completion.devices,
+        ),
     ] = None,
     sets: Sets = None,
     insecure: Annotated[
@@ -171,7 +191,12 @@ def recover(station: StationName, sets: Sets = None) -> None:
 @command("extrinsic check-device lab1.yaml wrist_ft", name="check-device")
 def check_device(
     station: StationName,
-    device: Annotated[str, typer.Argument(metavar="DEVICE", help="The device's name in the station file.")],
+    device: Annotated[
+        str,
+        typer.Argument(
+            metavar="DEVICE", help="The device's name in the station file.", autocompletion=completion.devices
+        ),
+    ],
     step: Annotated[
         list[str] | None, typer.Option("--step", metavar="STEP", help="Take this step only; may be repeated.")
     ] = None,
@@ -192,7 +217,7 @@ def check_device(
     from experiments.files import load_station
 
     load_station(station, sets or [], [device])  # refuses one that the station has not
-    config, console = load_station(station, sets or []), terminal()
+    config, console = load_station(station, sets or []), beside(json_file)
     person = whoever_is_here(console, yes=yes)
     steps = tuple(step or ())
     code = walk_through(
@@ -203,7 +228,7 @@ def check_device(
 
 @command("extrinsic report runs/grasped_pivoting-20260101T120000.000000")
 def report(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    run_folder: Run,
 ) -> None:
     """Rebuild a run's report from its log."""
     from experiments.report.build import build_report
@@ -216,7 +241,7 @@ def report(
 
 @command("extrinsic repair runs/grasped_pivoting-20260101T120000.000000")
 def repair(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    run_folder: Run,
 ) -> None:
     """Mend a log that was cut off, beside it; rebuild results.json and the report."""
     from experiments import repair as mending
@@ -226,7 +251,7 @@ def repair(
 
 @command("extrinsic replay runs/grasped_pivoting-20260101T120000.000000 --check")
 def replay(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    run_folder: Run,
     json_file: JsonFile = None,
     check_same: Annotated[bool, typer.Option("--check", help="Exit with 1 when an estimate differs.")] = False,
 ) -> None:
@@ -234,19 +259,19 @@ def replay(
     from experiments import replay as replaying
     from experiments.run_folder import RunFolder
 
-    raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, terminal()))
+    raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, beside(json_file)))
 
 
 @command("extrinsic bench sim --check")
 def bench(
-    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="sim, estimation, planning, load or bus.")],
+    name: Benchmark,
     runs: Annotated[
         int | None,
         typer.Option("--runs", min=1, help="Measurements per figure of sim, estimation, planning; 5."),
     ] = None,
     json_file: JsonFile = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write BENCHMARK.json into DIR.")] = None,
-    check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
+    check_targets: CheckTargets = False,
     horizons: Annotated[
         str | None, typer.Option("--horizons", metavar="K,...", help="Steps of the problems of `planning`.")
     ] = None,
@@ -261,7 +286,7 @@ def bench(
     """Measure speed, accuracy and steadiness, figure beside target, in one run."""
     from experiments import bench as benchmarks
 
-    options = benchmarks.Options(runs, _horizons(horizons), minutes, viewers)
+    options = benchmarks.Options(runs, benchmarks.horizons_of(horizons), minutes, viewers)
     raise typer.Exit(benchmarks.main(name, options, json_file, out, check_targets))
 
 
@@ -278,9 +303,7 @@ def sweep(
     station: StationOption = None,
     sets: Sets = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes on this machine; 2.")] = None,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of a Dask scheduler.")
-    ] = None,
+    scheduler: Scheduler = None,
     retries: Annotated[
         int, typer.Option("--retries", min=0, help="So often a job runs again whose worker or device failed.")
     ] = 2,
@@ -307,30 +330,15 @@ def sweep(
         retries=retries,
         out=out,
         json_file=json_file,
-        console=terminal(),
+        console=beside(json_file),
         said=terminal(stderr=True),
     )
     raise typer.Exit(code)
 
 
-def _horizons(text: str | None) -> tuple[int, ...] | None:
-    """Numbers of steps. Raises InputError for anything else."""
-    from mechanics.yaml_input import InputError, Problem
-
-    if text is None:
-        return None
-    words = text.split(",")
-    if not all(word.strip().isdecimal() and 1 <= int(word) <= 100_000 for word in words):
-        wrong, expected = f"{text!r} are no horizons", "whole numbers of steps, such as 40,200,1000"
-        raise InputError([Problem("bench", None, "--horizons", wrong, expected)])
-    return tuple(dict.fromkeys(int(word) for word in words))
-
-
 @command("extrinsic table pivoting --seed 1 --check")
 def table(
-    name: Annotated[
-        str, typer.Argument(metavar="TABLE", help="grasped, extrinsic, pivoting, optimizers, or a table file.")
-    ],
+    name: TableName,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulated laboratory and its trials.")] = 0,
     trials: Annotated[
         int | None, typer.Option("--trials", metavar="N", min=1, help="A part: so many trials of each trajectory.")
@@ -338,14 +346,12 @@ def table(
     runs: Annotated[str | None, typer.Option("--runs", metavar="RUN,...", help="A part: these runs only.")] = None,
     sets: Sets = None,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Jobs at a time on this machine.")] = 2,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, tcp://host:port.")
-    ] = None,
+    scheduler: Scheduler = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="The table's folder; one begun goes on.")
     ] = None,
     json_file: JsonFile = None,
-    check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
+    check_targets: CheckTargets = False,
 ) -> None:
     """Run a table of the paper: calibrate, run its trials, print our figures beside the paper's."""
     from experiments.table import run as tables

@@ -31,8 +31,9 @@ from experiments.calibrate.store import Calibrations
 from experiments.exit_codes import ExitCode
 from experiments.files import Resolved, load
 from experiments.fingers import fingers
+from experiments.json_output import put
 from experiments.looks import BEGIN
-from experiments.run_folder import RunFolder, write_json
+from experiments.run_folder import RunFolder
 from mechanics import se2
 from mechanics.readings import Array
 from mechanics.records import ContactBelief, LookRecord, PlanarState, TrialRecord, WaypointRecord
@@ -279,9 +280,7 @@ def main(folder: RunFolder, json_file: Path | None, check: bool, console: Consol
     figures = (f"{value:.3g} {unit.replace('contact_mm', 'mm of contact')}" for unit, value in largest(found).items())
     said = f"{len(found)} waypoints estimated again, {len(differing)} differ; at most {', '.join(figures)}"
     console.print(said, soft_wrap=True, highlight=False)
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        write_json(json_file, as_json(found))
+    put(json_file, as_json(found))
     return ExitCode.FELL_SHORT if check and (differing or not found) else ExitCode.DONE
 
 

@@ -255,6 +255,22 @@ def _finish(outcome: Outcome, console: Console) -> Outcome:
     return outcome
 
 
+def what_next(outcome: Outcome) -> list[str]:
+    """The commands that help after a run that did not end as it should, a line each."""
+    folder, station = outcome.folder.path, outcome.results["station"]
+    go_on = f"go on with it: extrinsic run --resume {folder}"
+    match outcome.exit_code:
+        case ExitCode.INTERRUPTED:
+            return [go_on]
+        case ExitCode.DEVICE_FAILED:
+            return [f"how the devices are: extrinsic status {station}", go_on]
+        case ExitCode.STOPPED:
+            return [f"once the reason is gone: extrinsic recover {station}", go_on]
+        case ExitCode.INFEASIBLE:
+            return [f"what the task needs: extrinsic check {folder / 'experiment.yaml'}"]
+    return []
+
+
 def _ask(console: Console) -> Callable[[str], bool]:
     def ask(what: str) -> bool:
         if not sys.stdin.isatty():

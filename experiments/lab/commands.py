@@ -116,7 +116,7 @@ def revoke(
 def renew(
     station: StationName,
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="Members, as runner-alice; all by default.")
+        list[str] | None, typer.Argument(metavar="NAME", help="Members, as runner-alice; all by default.")
     ] = None,
     days: Days = 365,
     sets: Sets = None,
