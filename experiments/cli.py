@@ -379,7 +379,7 @@ def _check_packages() -> str | None:
 
 def main() -> None:
     """Entry point."""
-    prepare()
+    prepare(app)
     problem = _check_packages()
     if problem:
         sys.exit(f"extrinsic: {problem}")

@@ -17,7 +17,7 @@ from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
-from rich.markup import escape
+from rich.text import Text
 
 from drivers.config import StationConfig
 from drivers.errors import DriverError
@@ -121,13 +121,13 @@ def _live(config: StationConfig, looking: StationWatch, period: float, console: 
 def _picture(config: StationConfig, rows: Sequence[DeviceStatus], certificates: Certificates, width: int) -> Group:
     alive = sum(row.alive for row in rows)
     stopped = [f"{row.name} is stopped: {row.arm.stopped}" for row in rows if row.arm is not None and row.arm.stopped]
-    head = f"[bold]{escape(config.name)}[/] at {escape(config.bus.endpoint)}: {alive} of {len(rows)} devices alive"
-    said = [f"[bold red]{escape(text)}[/]" for text in stopped]
+    head = Text.assemble((config.name, "bold"), f" at {config.bus.endpoint}: {alive} of {len(rows)} devices alive")
+    said = [Text(text, "bold red") for text in stopped]
     if stopped:
-        said.append("once its reason is gone: `extrinsic recover STATION`")
+        said.append(Text("once its reason is gone: `extrinsic recover STATION`"))
     elif not alive and not all(row.trouble == LOOKING for row in rows):
-        said.append(escape(how_to_start(config)))
-    foot = f"[dim]{datetime.now():%H:%M:%S}; q or Ctrl-C ends it[/]"
+        said.append(Text(how_to_start(config)))
+    foot = Text(f"{datetime.now():%H:%M:%S}; q or Ctrl-C ends it", "dim")
     return Group(head, status_table(rows, certificates, width=width, models=False), *said, foot)
 
 

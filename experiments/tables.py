@@ -10,6 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from drivers.status import DeviceStatus
 from drivers.wire.security import WARNING_DAYS
@@ -89,8 +90,8 @@ def faults_table(rows: Sequence[dict[str, Any]]) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for name in ("fault", "device", "moment", "ended"):
         table.add_column(name, no_wrap=True)
-    table.add_column("moved on [ms]", justify="right")
-    table.add_column("force [N]", justify="right")
+    table.add_column(escape("moved on [ms]"), justify="right")
+    table.add_column(escape("force [N]"), justify="right")
     table.add_column("short", overflow="fold")
     for row in rows:
         fault = row["fault"]
@@ -112,6 +113,8 @@ def faults_table(rows: Sequence[dict[str, Any]]) -> Table:
 
 #: columns from which on a status table has room for notes
 _NOTES_BESIDE = 100
+#: and for the kinds of devices
+_KINDS = 72
 
 
 def status_table(
@@ -123,10 +126,10 @@ def status_table(
 ) -> Group:
     """One line per device, then one per certificate, by its name and the days that it has left.
 
-    In less than 100 columns (``width``) the notes stand below the table, in less than 60 the kinds are left out.
+    In less than 100 columns (``width``) the notes stand below the table, in less than 72 the kinds are left out.
     ``models``: whether devices say what they are, where there is room.
     """
-    beside, kinds = width >= _NOTES_BESIDE, width >= 60
+    beside, kinds = width >= _NOTES_BESIDE, width >= _KINDS
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1) if beside else (0, 1, 0, 0), show_edge=False)
     for name in ("device", "kind", "backend", "alive") if kinds else ("device", "alive"):
         table.add_column(name, no_wrap=True)
@@ -160,5 +163,5 @@ def status_table(
             note += "; `extrinsic lab renew` makes a new one"
         style = "yellow" if soon and valid else None if valid else "red"
         add(name, ("certificate", ""), ("yes" if valid else "no", "", "", ""), note, style)
-    notes = [f"{escape(', '.join(names))}: {escape(note)}" for note, names in below.items()]
-    return Group(table, *([""] if notes else []), *notes)
+    notes = [Text(f"{', '.join(names)}: {note}") for note, names in below.items()]
+    return Group(table, *([Text()] if notes else []), *notes)

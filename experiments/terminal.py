@@ -11,11 +11,19 @@ import io
 import os
 import sys
 import unicodedata
+from collections.abc import Iterable
 from typing import Any
 
-from rich.console import Console
+import typer
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+from rich.table import Table
 from rich.text import Text
 
+from experiments.narrow import fits, stacked
+
+#: columns from which on help is drawn in boxes
+_BOXES = 80
 _HANDLER = "extrinsic.ascii"
 _ASCII = {
     "±": "+-", "µ": "u", "μ": "u", "°": " deg", "²": "2", "³": "3", "·": ".", "×": "x", "…": "...", "−": "-", "–": "-",
@@ -47,12 +55,18 @@ def plain(text: str, encoding: str) -> str:
 
 
 class Terminal(Console):
-    """A console whose text is of its stream's encoding before it is laid out."""
+    """A console whose text is of its stream's encoding before it is laid out, and whose tables can always be read."""
 
     def render_str(self, text: str, **options: Any) -> Text:
         """As `Console.render_str`."""
         encoding = self.encoding
         return super().render_str(text if encoding.startswith("utf") else plain(text, encoding), **options)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """As `Console.render`; a table with headings that is too wide comes as `experiments.narrow.stacked`."""
+        if isinstance(renderable, Table) and renderable.show_header:
+            renderable = renderable if fits(renderable, self, options or self.options) else stacked(renderable, self)
+        return super().render(renderable, options)
 
 
 def colourless() -> bool:
@@ -72,11 +86,13 @@ def terminal(*, stderr: bool = False, file_width: int | None = None, prose: bool
     return Terminal(stderr=stderr, width=width, color_system=colours, soft_wrap=prose, highlight=not prose)
 
 
-def prepare() -> None:
-    """Have both streams of this process write anything; typer's help as the terminal is. Called once, at the start."""
+def prepare(app: typer.Typer) -> None:
+    """Have both streams of this process write anything, and the help of ``app`` as the terminal is; at the start."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors != "surrogateescape":
             stream.reconfigure(errors=_HANDLER)
+    # the boxes of typer's help cut off what stands in them where there is no room
+    app.rich_markup_mode = "rich" if terminal().width >= _BOXES else None
     if colourless():
         from typer import rich_utils
 
