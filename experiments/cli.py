@@ -231,11 +231,13 @@ def report(
     run_folder: Run,
 ) -> None:
     """Rebuild a run's report from its log."""
+    from experiments.progress import Progress
     from experiments.report.build import build_report
     from experiments.run_folder import RunFolder
 
     folder = RunFolder.open(run_folder)
-    build_report(folder)
+    with Progress(terminal(stderr=True)).share("make the report") as heard:
+        build_report(folder, heard)
     terminal().print(f"report: {folder.report}", soft_wrap=True, highlight=False)
 
 
@@ -245,8 +247,9 @@ def repair(
 ) -> None:
     """Mend a log that was cut off, beside it; rebuild results.json and the report."""
     from experiments import repair as mending
+    from experiments.progress import Progress
 
-    mending.say(mending.repair(run_folder), terminal())
+    mending.say(mending.repair(run_folder, Progress(terminal(stderr=True))), terminal())
 
 
 @command("extrinsic replay runs/grasped_pivoting-20260101T120000.000000 --check")
