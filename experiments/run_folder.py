@@ -61,7 +61,8 @@ class RunFolder:
     def open(cls, path: Path) -> RunFolder:
         """An existing run folder. Raises InputError when there is none."""
         if not (path / "experiment.yaml").is_file():
-            wrong = "no experiment.yaml in it, so no run folder" if path.exists() else "it is not there, so no run folder"
+            why = "no experiment.yaml in it" if path.exists() else "it is not there"
+            wrong = f"{why}, so no run folder"
             newest = max(Path("runs").glob("*/experiment.yaml"), key=lambda file: file.stat().st_mtime, default=None)
             near = "" if newest is None else str(newest.parent)
             expected = "a folder under runs/; `extrinsic run EXPERIMENT` makes one"
