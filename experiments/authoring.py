@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
+from rich.markup import escape
 
+from experiments import completion
 from experiments.command import commands
+from experiments.terminal import terminal
 
 app = typer.Typer()
 command = commands(app)
@@ -19,20 +21,32 @@ command = commands(app)
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder, new or empty.")],
     experiment: Annotated[
-        str, typer.Option("--experiment", metavar="EXPERIMENT", help="The shipped experiment to begin with.")
+        str,
+        typer.Option(
+            "--experiment",
+            metavar="EXPERIMENT",
+            help="The shipped experiment to begin with.",
+            autocompletion=completion.experiments,
+        ),
     ] = "grasped_pivoting",
     station: Annotated[
-        str, typer.Option("--station", metavar="STATION", help="The shipped station to begin with.")
+        str,
+        typer.Option(
+            "--station",
+            metavar="STATION",
+            help="The shipped station to begin with.",
+            autocompletion=completion.stations,
+        ),
     ] = "sim",
 ) -> None:
     """Make a folder with an experiment, its station, schemas for editors and a README; ready to run."""
     from experiments.new_folder import EXPERIMENT, README, STATION, new_folder
 
     new_folder(folder, experiment, station)
-    console = Console(soft_wrap=True, highlight=False, markup=False)
-    console.print(f"{folder}: {EXPERIMENT} ({experiment}), {STATION} ({station}), {README}, schemas/")
+    console = terminal(prose=True)
+    console.print(f"{escape(str(folder))}: {EXPERIMENT} ({experiment}), {STATION} ({station}), {README}, schemas/")
     change = "" if folder.resolve() == Path.cwd() else f"cd {shlex.quote(str(folder))} && "
-    console.print(f"next: {change}extrinsic run {EXPERIMENT}")
+    console.print(f"next: {escape(change)}extrinsic run {EXPERIMENT}")
 
 
 @command("extrinsic schema experiment --out schemas/experiment.json")

@@ -8,12 +8,26 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
+from rich.markup import escape
 
-from experiments import __version__, authoring, kernels
-from experiments.command import Sets, StationName, commands
+from experiments import __version__, authoring, completion, kernels
+from experiments.command import (
+    Benchmark,
+    CheckTargets,
+    Experiment,
+    JsonFile,
+    Run,
+    Scheduler,
+    Sets,
+    StationName,
+    StationOption,
+    TableName,
+    commands,
+)
 from experiments.exit_codes import ExitCode
+from experiments.json_output import beside
 from experiments.lab.commands import app as lab
+from experiments.terminal import prepare, terminal
 
 app = typer.Typer(
     name="extrinsic",
@@ -45,19 +59,14 @@ def _options(
     pass
 
 
-Experiment = Annotated[str, typer.Argument(metavar="EXPERIMENT", help="An experiment file, or a shipped one's name.")]
-StationOption = Annotated[
-    str | None,
-    typer.Option("--station", metavar="STATION", help="Run on this station, not the experiment's own."),
-]
-
-
 @command("extrinsic run grasped_pivoting --set world.stiffness_scale=0.8")
 def run(
     experiment: Annotated[
         str | None,
         typer.Argument(
-            metavar="[EXPERIMENT]", help="An experiment file, or a shipped one's name; may be left out with --resume."
+            metavar="EXPERIMENT",
+            help="An experiment file, or a shipped one's name; may be left out with --resume.",
+            autocompletion=completion.experiments,
         ),
     ] = None,
     station: StationOption = None,
@@ -71,7 +80,12 @@ def run(
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option("--resume", metavar="RUN", help="Go on with the run in this folder where it was cut off."),
+        typer.Option(
+            "--resume",
+            metavar="RUN",
+            help="Go on with the run in this folder where it was cut off.",
+            autocompletion=completion.runs,
+        ),
     ] = None,
 ) -> None:
     """Run an experiment: plan, execute, log, measure, report."""
@@ -86,36 +100,41 @@ def run(
     chosen += [] if speed is None else [f"trial.speed={speed:g}"]
     if resume is not None:
         refuse_besides({"--set": sets, "--out": out, "--rehearse": rehearse, "--speed": speed})
-        outcome = go_on(resume, experiment, station, Console(stderr=True))
+        outcome = go_on(resume, experiment, station, terminal(stderr=True))
     elif experiment is None:
         raise InputError([Problem("run", None, "EXPERIMENT", "it is missing", "an experiment, or --resume RUN")])
     else:
-        outcome = runner.run(load(experiment, station, chosen), out, Console(stderr=True))
-    console = Console()
+        outcome = runner.run(load(experiment, station, chosen), out, terminal(stderr=True))
+    console = terminal()
     faults = outcome.results.get("faults")
     console.print("", faults_table(faults) if faults else error_table(outcome.results), "", sep="\n")
     if outcome.exit_code is not ExitCode.DONE:
-        Console(stderr=True, soft_wrap=True).print(f"[red]{outcome.results['status']}[/]: {outcome.reason}")
+        said = terminal(stderr=True, prose=True)
+        said.print(f"[red]{outcome.results['status']}[/]: {escape(outcome.reason)}")
+        for line in runner.what_next(outcome):
+            said.print(line, markup=False)
     console.print(f"report: {outcome.folder.report}", soft_wrap=True, highlight=False)
     raise typer.Exit(outcome.exit_code)
 
 
 @command("extrinsic check experiments/grasped_static.yaml --station sim")
-def check(experiment: Experiment, station: StationOption = None, sets: Sets = None) -> None:
+def check(experiment: Experiment, station: StationOption = None, sets: Sets = None, json_file: JsonFile = None) -> None:
     """Validate and resolve an experiment and dry-run its sequence; touches no device."""
-    from experiments.check import check as dry_run
-    from experiments.files import load
+    from experiments.check import main as dry_run
 
-    console = Console()
-    for line in dry_run(load(experiment, station, sets or [])):
-        console.print(line, soft_wrap=True, highlight=False)
+    dry_run(experiment, station, sets or [], json_file)
 
 
 @command("extrinsic serve sim --set world.clock=realtime")
 def serve(
     station: StationName,
     devices: Annotated[
-        list[str] | None, typer.Argument(metavar="[DEVICE]...", help="Serve only these devices; all by default.")
+        list[str] | None,
+        typer.Argument(
+            metavar="DEVICE",
+            help="Serve only these devices; all by default.",
+            autocompletion=completion.devices,
+        ),
     ] = None,
     sets: Sets = None,
     insecure: Annotated[
@@ -138,17 +157,30 @@ def emulate(station: StationName, sets: Sets = None) -> None:
     raise typer.Exit(emulate_lab(load_station(station, sets or [])))
 
 
-@command("extrinsic status sim")
-def status(station: StationName, sets: Sets = None) -> None:
-    """Show every device of a station: alive, rate, age, faults."""
-    from drivers.status import station_certificates, station_status
+@command("extrinsic status sim --watch")
+def status(
+    station: StationName,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Go on showing it until q or Ctrl-C; a plain line per device in a file.")
+    ] = False,
+    interval: Annotated[
+        float | None,
+        typer.Option(
+            "--interval", metavar="SECONDS", min=0.1, max=3600, help="How often --watch shows it: 0.5; 10 in a file."
+        ),
+    ] = None,
+    json_file: JsonFile = None,
+    sets: Sets = None,
+) -> None:
+    """Show every device of a station: alive, rate, age, lost readings, who commands it, what stopped it."""
+    from experiments import status as telling
     from experiments.files import load_station
-    from experiments.tables import status_table
+    from mechanics.yaml_input import InputError, Problem
 
     config = load_station(station, sets or [])
-    rows = station_status(config)
-    Console().print(status_table(rows, station_certificates(config)))
-    raise typer.Exit(ExitCode.DONE if all(row.alive for row in rows) else ExitCode.DEVICE_FAILED)
+    if not watch and interval is not None:
+        raise InputError([Problem("status", None, "--interval", "there is one look without --watch", "--watch")])
+    raise typer.Exit(telling.watch(config, interval, json_file) if watch else telling.once(config, json_file))
 
 
 @command("extrinsic stop sim")
@@ -158,7 +190,7 @@ def stop(station: StationName, sets: Sets = None) -> None:
     from experiments.files import load_station
 
     for arm in stop_arms(load_station(station, sets or [])):
-        Console().print(f"{arm.name} is stopped: {arm.reason}", soft_wrap=True, highlight=False)
+        terminal().print(f"{arm.name} is stopped: {arm.reason}", soft_wrap=True, highlight=False)
 
 
 @command("extrinsic recover sim")
@@ -169,13 +201,18 @@ def recover(station: StationName, sets: Sets = None) -> None:
 
     for arm in recover_arms(load_station(station, sets or [])):
         said = f"was stopped: {arm.reason}; it takes set-points again" if arm.reason else "was not stopped"
-        Console().print(f"{arm.name} {said}", soft_wrap=True, highlight=False)
+        terminal().print(f"{arm.name} {said}", soft_wrap=True, highlight=False)
 
 
 @command("extrinsic check-device lab1.yaml wrist_ft", name="check-device")
 def check_device(
     station: StationName,
-    device: Annotated[str, typer.Argument(metavar="DEVICE", help="The device's name in the station file.")],
+    device: Annotated[
+        str,
+        typer.Argument(
+            metavar="DEVICE", help="The device's name in the station file.", autocompletion=completion.devices
+        ),
+    ],
     step: Annotated[
         list[str] | None, typer.Option("--step", metavar="STEP", help="Take this step only; may be repeated.")
     ] = None,
@@ -187,9 +224,7 @@ def check_device(
     yes: Annotated[
         bool, typer.Option("--yes", help="Ask nobody: agree to what is asked for, leave out what needs a hand.")
     ] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the findings as JSON.")
-    ] = None,
+    json_file: JsonFile = None,
     sets: Sets = None,
 ) -> None:
     """Walk through the bring-up of one device: what to look at, what is measured, what it is worth."""
@@ -198,7 +233,7 @@ def check_device(
     from experiments.files import load_station
 
     load_station(station, sets or [], [device])  # refuses one that the station has not
-    config, console = load_station(station, sets or []), Console()
+    config, console = load_station(station, sets or []), beside(json_file)
     person = whoever_is_here(console, yes=yes)
     steps = tuple(step or ())
     code = walk_through(
@@ -209,52 +244,53 @@ def check_device(
 
 @command("extrinsic report runs/grasped_pivoting-20260101T120000.000000")
 def report(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    run_folder: Run,
 ) -> None:
     """Rebuild a run's report from its log."""
+    from experiments.progress import Progress
     from experiments.report.build import build_report
     from experiments.run_folder import RunFolder
 
     folder = RunFolder.open(run_folder)
-    build_report(folder)
-    Console().print(f"report: {folder.report}", soft_wrap=True, highlight=False)
+    with Progress(terminal(stderr=True)).share("make the report") as heard:
+        build_report(folder, heard)
+    terminal().print(f"report: {folder.report}", soft_wrap=True, highlight=False)
 
 
 @command("extrinsic repair runs/grasped_pivoting-20260101T120000.000000")
 def repair(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    run_folder: Run,
 ) -> None:
     """Mend a log that was cut off, beside it; rebuild results.json and the report."""
     from experiments import repair as mending
+    from experiments.progress import Progress
 
-    mending.say(mending.repair(run_folder), Console())
+    mending.say(mending.repair(run_folder, Progress(terminal(stderr=True))), terminal())
 
 
 @command("extrinsic replay runs/grasped_pivoting-20260101T120000.000000 --check")
 def replay(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the estimates as JSON.")
-    ] = None,
+    run_folder: Run,
+    json_file: JsonFile = None,
     check_same: Annotated[bool, typer.Option("--check", help="Exit with 1 when an estimate differs.")] = False,
 ) -> None:
     """Estimate a recorded run again, from its log, with the code of today; show what differs."""
     from experiments import replay as replaying
     from experiments.run_folder import RunFolder
 
-    raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, Console()))
+    raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, beside(json_file)))
 
 
 @command("extrinsic bench sim --check")
 def bench(
-    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="sim, estimation, planning, load or bus.")],
+    name: Benchmark,
     runs: Annotated[
         int | None,
         typer.Option("--runs", min=1, help="Measurements per figure of sim, estimation, planning; 5."),
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
+    json_file: JsonFile = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write BENCHMARK.json into DIR.")] = None,
-    check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
+    check_targets: CheckTargets = False,
     horizons: Annotated[
         str | None, typer.Option("--horizons", metavar="K,...", help="Steps of the problems of `planning`.")
     ] = None,
@@ -269,7 +305,7 @@ def bench(
     """Measure speed, accuracy and steadiness, figure beside target, in one run."""
     from experiments import bench as benchmarks
 
-    options = benchmarks.Options(runs, _horizons(horizons), minutes, viewers)
+    options = benchmarks.Options(runs, benchmarks.horizons_of(horizons), minutes, viewers)
     raise typer.Exit(benchmarks.main(name, options, json_file, out, check_targets))
 
 
@@ -286,16 +322,14 @@ def sweep(
     station: StationOption = None,
     sets: Sets = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes on this machine; 2.")] = None,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of a Dask scheduler.")
-    ] = None,
+    scheduler: Scheduler = None,
     retries: Annotated[
         int, typer.Option("--retries", min=0, help="So often a job runs again whose worker or device failed.")
     ] = 2,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="The sweep's folder; one that was cut off goes on.")
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the summary as JSON.")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Run every combination of a grid, every seed and trial, on workers; one table of all trials."""
     from experiments.campaign.sweep import sweep as run_sweep
@@ -315,30 +349,15 @@ def sweep(
         retries=retries,
         out=out,
         json_file=json_file,
-        console=Console(),
-        said=Console(stderr=True),
+        console=beside(json_file),
+        said=terminal(stderr=True),
     )
     raise typer.Exit(code)
 
 
-def _horizons(text: str | None) -> tuple[int, ...] | None:
-    """Numbers of steps. Raises InputError for anything else."""
-    from mechanics.yaml_input import InputError, Problem
-
-    if text is None:
-        return None
-    words = text.split(",")
-    if not all(word.strip().isdecimal() and 1 <= int(word) <= 100_000 for word in words):
-        wrong, expected = f"{text!r} are no horizons", "whole numbers of steps, such as 40,200,1000"
-        raise InputError([Problem("bench", None, "--horizons", wrong, expected)])
-    return tuple(dict.fromkeys(int(word) for word in words))
-
-
 @command("extrinsic table pivoting --seed 1 --check")
 def table(
-    name: Annotated[
-        str, typer.Argument(metavar="TABLE", help="grasped, extrinsic, pivoting, optimizers, or a table file.")
-    ],
+    name: TableName,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulated laboratory and its trials.")] = 0,
     trials: Annotated[
         int | None, typer.Option("--trials", metavar="N", min=1, help="A part: so many trials of each trajectory.")
@@ -346,16 +365,12 @@ def table(
     runs: Annotated[str | None, typer.Option("--runs", metavar="RUN,...", help="A part: these runs only.")] = None,
     sets: Sets = None,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Jobs at a time on this machine.")] = 2,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, tcp://host:port.")
-    ] = None,
+    scheduler: Scheduler = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="The table's folder; one begun goes on.")
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write table.json there, too.")
-    ] = None,
-    check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
+    json_file: JsonFile = None,
+    check_targets: CheckTargets = False,
 ) -> None:
     """Run a table of the paper: calibrate, run its trials, print our figures beside the paper's."""
     from experiments.table import run as tables
@@ -383,6 +398,7 @@ def _check_packages() -> str | None:
 
 def main() -> None:
     """Entry point."""
+    prepare(app)
     problem = _check_packages()
     if problem:
         sys.exit(f"extrinsic: {problem}")

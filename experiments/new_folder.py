@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import re
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 from string import Template
 
-from experiments import __version__
+from experiments import __version__, shipped
 from experiments.editors import MODELINE, SCHEMAS
-from experiments.files import PACKAGE, load
+from experiments.files import load
 from mechanics.yaml_input import InputError, Problem, nearest, one_of, read_yaml
 
 EXPERIMENT, STATION, README = "experiment.yaml", "station.yaml", "README.md"
@@ -21,25 +22,14 @@ IGNORED = "runs/\n"
 TEMPLATE = Path(__file__).with_suffix(".md")
 
 
-def shipped_experiments() -> dict[str, Path]:
-    """The experiments that come with the package, by name: those of its YAML files that have stages."""
-    found = {file.stem: file for file in sorted(PACKAGE.glob("*.yaml"))}
-    return {name: file for name, file in found.items() if "stages" in read_yaml(file).data}
-
-
-def shipped_stations() -> dict[str, Path]:
-    """The stations that come with the package, by name."""
-    return {file.stem: file for file in sorted((PACKAGE / "stations").glob("*.yaml"))}
-
-
 def new_folder(folder: Path, experiment: str, station: str) -> None:
     """Fill ``folder``, which is new or empty, with copies of a shipped experiment and a shipped station.
 
     The copy of the experiment names the copy of the station. Raises InputError, and leaves what was there: everything
     is made aside first.
     """
-    source = _one_of(shipped_experiments(), experiment, "--experiment")
-    devices = _one_of(shipped_stations(), station, "--station")
+    source = _one_of(shipped.experiments(), shipped.FOLDER, experiment, "--experiment")
+    devices = _one_of(shipped.stations(), shipped.STATIONS, station, "--station")
     load(str(source), str(devices))  # the two may not suit each other
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -63,11 +53,12 @@ def new_folder(folder: Path, experiment: str, station: str) -> None:
         raise InputError([Problem(repr(str(folder))[1:-1], None, "DIR", wrong, expected)]) from None
 
 
-def _one_of(shipped: dict[str, Path], name: str, option: str) -> Path:
-    if name not in shipped:
+def _one_of(known: Iterable[str], folder: Path, name: str, option: str) -> Path:
+    names = list(known)
+    if name not in names:
         wrong = f"{name!r} is not shipped"
-        raise InputError([Problem("init", None, option, wrong, one_of(shipped), nearest(name, shipped))])
-    return shipped[name]
+        raise InputError([Problem("init", None, option, wrong, one_of(names), nearest(name, names))])
+    return folder / f"{name}.yaml"
 
 
 def _fill(folder: Path, experiment: Path, station: Path, name: str) -> None:

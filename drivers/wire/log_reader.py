@@ -49,6 +49,7 @@ class Break(NamedTuple):
 
 class LogReader:
     """A log file. After an iteration ``ending`` is ``complete``, or says where and why the file broke off.
+    ``share`` is how much of it the iteration has read.
 
     With ``salvage`` it goes on behind damage, at the next chunk whose check sum is right; ``breaks`` are the stretches
     that are lost. A chunk that the file ends within is one: nothing vouches for a part of it. Raises ProtocolError for
@@ -59,6 +60,7 @@ class LogReader:
         self.path = Path(path)
         self.ending = "not read yet"
         self.breaks: list[Break] = []
+        self.share = 0.0
         self._salvage = salvage
         with self.path.open("rb") as file:
             magic = file.read(len(MAGIC))
@@ -151,6 +153,7 @@ class LogReader:
                     return
             crc = None if crc is None else record.crc(crc)
             at = record.end
+            self.share = at / size
 
     def _behind(self, file: BinaryIO, broken: Broken, size: int) -> Iterator[McapRecord]:
         """What the end of the file says of topics; returns where reading goes on, None where nothing follows."""

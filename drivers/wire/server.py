@@ -248,6 +248,8 @@ class DeviceServer:
 
     def _verbs(self) -> None:
         device = self.device
+        if isinstance(device, Sensor):
+            self._serve("health", lambda _: self._health(device), direct=True)
         if isinstance(device, ForceTorqueSensor):
             self._serve("tare", lambda _: device.tare())
         if isinstance(device, Gripper):
@@ -259,6 +261,10 @@ class DeviceServer:
             self._serve("image", lambda _: _picture(device.image()))
         if isinstance(device, TactileSensor):
             self._serve("reference", lambda _: self._reference(device))
+
+    def _health(self, device: Sensor) -> Answer:
+        """What a view cannot tell: what was lost before it came here, or could not be read, since the device opened."""
+        return Answer(json.dumps({"gaps": device.gaps, "corrupt": device.corrupt}))
 
     def capture_if_wanted(self) -> None:
         """Take a frame if somebody listens: the stream of a camera that has no thread of its own.

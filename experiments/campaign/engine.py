@@ -24,6 +24,7 @@ from experiments.campaign.jobs import FAILED, Job, JobOutcome, examine, resolve
 from experiments.campaign.progress import Tell, progress
 from experiments.campaign.work import JobFailed, Unattended, Unsampled, work
 from experiments.interrupt import Interrupt
+from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem
 
 #: how long a scheduler may take to answer, and to have a worker [s]
@@ -60,7 +61,7 @@ def run_jobs(
     NotConnected when the scheduler goes or no worker comes; and KeyboardInterrupt. A campaign that was cut off goes on
     when it is started again.
     """
-    console = console or Console(stderr=True)
+    console = console or terminal(stderr=True)
     if not jobs:
         return []
     campaign, resolved = CampaignFolder(folder), resolve(jobs)

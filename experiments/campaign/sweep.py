@@ -16,7 +16,7 @@ from experiments.campaign.engine import run_jobs
 from experiments.campaign.folder import CampaignFolder
 from experiments.campaign.grid import parse_grid, parse_seeds, sweep_jobs
 from experiments.exit_codes import ExitCode
-from experiments.run_folder import write_json
+from experiments.json_output import put
 
 
 def sweep(
@@ -72,9 +72,7 @@ def _conclude(folder: Path, code: ExitCode, json_file: Path | None, console: Con
         return  # it was interrupted before anything was started
     summary, trials = _summary(campaign, code)
     frame.save(folder, summary, trials)
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        write_json(json_file, summary)
+    put(json_file, summary)
     console.print(frame.summary_table(f"sweep of {summary['experiment']}", summary["cells"]))
     for job in summary["failed"]:
         said.print(f"{job['id']}: {job['reason']}", style="red", highlight=False, markup=False, soft_wrap=True)

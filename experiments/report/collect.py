@@ -18,6 +18,7 @@ from experiments.calibrate.samples import load_samples
 from experiments.calibrate.store import prints
 from experiments.files import Resolved, load
 from experiments.paper import beside
+from experiments.progress import Heard, unheard
 from experiments.results_file import ShownResults, read_json
 from experiments.run_folder import RunFolder
 from mechanics import se2
@@ -27,6 +28,7 @@ from mechanics.yaml_input import InputError, Problem
 from planning.plan import Plan
 
 SECOND = 1e-9
+_TELL = 1000  # messages
 
 
 @dataclass
@@ -52,15 +54,17 @@ class Logs:
     current: LoggedTrial | None = None
 
 
-def collect(folder: RunFolder) -> dict[str, Any]:
+def collect(folder: RunFolder, heard: Heard = unheard) -> dict[str, Any]:
     """The data that `experiments.report.page.render` takes, from what lies in ``folder``, torn or whole.
+
+    ``heard`` is called with the share of the logs that has been read.
 
     Raises InputError when the folder's experiment or its results cannot be read.
     """
     resolved = load(str(folder.experiment))
     results = _results(folder)
     known = results.get("calibration") or {}
-    log, files = read_logs(folder, resolved.experiment.report.playback_rate), folder.logs()
+    log, files = read_logs(folder, resolved.experiment.report.playback_rate, heard), folder.logs()
     mended = [told for told in (results.get("repair") or {"logs": []})["logs"] if told["ending"] != "complete"]
     if log.ending == "complete" and mended:
         log.ending = f"{mended[0]['ending']}; what was whole has been mended"
@@ -143,28 +147,30 @@ def _nominal(resolved: Resolved) -> list[dict[str, Any]]:
     ]
 
 
-def read_logs(folder: RunFolder, rate: float) -> Logs:
-    """One pass over the logs of a run; truth is thinned to ``rate`` [Hz] on the way.
+def read_logs(folder: RunFolder, rate: float, heard: Heard = unheard) -> Logs:
+    """One pass over the logs of a run; truth is thinned to ``rate`` [Hz] on the way. ``heard`` as in `collect`.
 
     Of a trial that was run again, in the same log or in that of the run that went on, the last attempt counts.
     """
-    log = Logs()
-    for file in folder.logs():
+    log, files = Logs(), folder.logs()
+    for number, file in enumerate(files):
         log.current = None
-        ending = _read(file, log, rate)
+        ending = _read(file, log, rate, lambda share, before=number: heard((before + share) / len(files)))
         if log.ending in ("complete", "there is no log"):
             log.ending = ending
     return log
 
 
-def _read(file: Path, log: Logs, rate: float) -> str:
+def _read(file: Path, log: Logs, rate: float, heard: Heard) -> str:
     """Add what is in one file; how it ends."""
     try:
         reader = LogReader(file)
     except ProtocolError as error:
         return error.got
     last_ns = next_truth = 0
-    for message in reader.messages():
+    for count, message in enumerate(reader.messages()):
+        if count % _TELL == 0:
+            heard(reader.share)
         log.counts[message.topic] = log.counts.get(message.topic, 0) + 1
         last_ns = max(last_ns, message.publish_ns)
         is_truth = message.topic.endswith("/world/truth")

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from rich.console import Console
 
 from experiments.bench.figures import TARGETS, Target, Targets
 from experiments.exit_codes import ExitCode
+from experiments.json_output import beside, put
 from experiments.paper import tables as paper_tables
 from experiments.provenance import provenance
 from experiments.run_folder import write_atomic, write_json
@@ -21,6 +19,7 @@ from experiments.table import aggregate, jobs, render
 from experiments.table.jobs import Options
 from experiments.table.measure import CalibrationFailed, Engine, measure
 from experiments.table.schema import Table
+from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem, parse, read_yaml
 
 #: columns of a table that goes to a file or a pipe
@@ -38,7 +37,7 @@ def main(
     """Make a table and show it. Raises InputError and InfeasiblePlan before anything is started."""
     table, sets = jobs.load_table(name, options.sets)
     options = Options(options.seed, options.trials, options.runs, sets)
-    said = Console(stderr=True)
+    said = terminal(stderr=True)
     folder = (out or Path("runs") / f"table_{table.name}-{datetime.now(UTC):%Y%m%dT%H%M%S.%f}").absolute()
     try:
         data = measure(table, options, engine, folder, said)
@@ -46,8 +45,9 @@ def main(
         said.print(f"[red]{error}[/]", soft_wrap=True, highlight=False)
         return ExitCode.DEVICE_FAILED if error.status in ("failed", "device_failed") else ExitCode.FELL_SHORT
     result = {**stated(table, options, data), "calibrations": believed(folder)}
-    keep(folder, result, data, json_file)
-    console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else FILE_WIDTH)
+    keep(folder, result, data)
+    put(json_file, result)
+    console = beside(json_file, FILE_WIDTH)
     render.show(console, result)
     console.print(f"table: {folder / 'table.md'}", soft_wrap=True, highlight=False)
     for line in result["shortfalls"] if check else []:
@@ -103,7 +103,7 @@ def _judged(found: aggregate.Finding, target: Target | None) -> dict[str, Any]:
     }
 
 
-def keep(folder: Path, result: dict[str, Any], data: aggregate.Data, json_file: Path | None) -> None:
+def keep(folder: Path, result: dict[str, Any], data: aggregate.Data) -> None:
     """Write table.json, table.md, trials.parquet and plans.parquet. Raises InputError where it cannot."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -113,9 +113,6 @@ def keep(folder: Path, result: dict[str, Any], data: aggregate.Data, json_file: 
             aside = folder / f".{name}.parquet"
             _plain(frame).to_parquet(aside, index=False)
             aside.replace(folder / f"{name}.parquet")
-        if json_file is not None:
-            json_file.parent.mkdir(parents=True, exist_ok=True)
-            write_json(json_file, result)
     except OSError as error:
         wrong = f"cannot be written: {error.strerror}"
         raise InputError([Problem(str(error.filename), None, "", wrong, "a place you may write to")]) from None

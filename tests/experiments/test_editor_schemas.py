@@ -11,9 +11,9 @@ from jsonschema import Draft7Validator
 from drivers.config import StationConfig
 from drivers.sim.mismatch import FOLDER as PROFILES
 from drivers.sim.mismatch import Mismatch
+from experiments import shipped
 from experiments.editors import KINDS, MODELINE, SCHEMAS, schema_text
 from experiments.files import PACKAGE, dump_resolved, load
-from experiments.new_folder import shipped_experiments, shipped_stations
 from experiments.schema import Experiment
 from experiments.table.schema import Table
 from mechanics.catalogue import CATALOGUE, SENSORS, ObjectModel, SensorModel
@@ -28,8 +28,8 @@ MODELS = {
     "table": Table,
 }
 SHIPPED = {
-    "experiment": sorted(shipped_experiments().values()),
-    "station": sorted(shipped_stations().values()),
+    "experiment": sorted(shipped.FOLDER / f"{name}.yaml" for name in shipped.experiments()),
+    "station": sorted(shipped.STATIONS / f"{name}.yaml" for name in shipped.stations()),
     "object": sorted(CATALOGUE.glob("*.yaml")),
     "sensor": sorted(SENSORS.glob("*.yaml")),
     "profile": sorted(PROFILES.glob("*.yaml")),

@@ -7,8 +7,9 @@ import pytest
 from jsonschema import Draft7Validator
 
 from experiments import new_folder as module
+from experiments import shipped
 from experiments.files import load
-from experiments.new_folder import new_folder, shipped_experiments, shipped_stations
+from experiments.new_folder import new_folder
 from mechanics.yaml_input import InputError, read_yaml
 
 MADE = {".gitignore", "README.md", "experiment.yaml", "schemas", "station.yaml"}
@@ -19,12 +20,12 @@ def contents(folder):
 
 
 def test_what_is_shipped_to_begin_with_are_experiments_and_stations():
-    assert {"demo", "grasped_pivoting", "extrinsic_pivoting", "calibrate"} <= set(shipped_experiments())
-    assert not {"targets", "paper_tables", "table_grasped"} & set(shipped_experiments())
-    assert {"sim", "emulated_lab", "example_lab"} <= set(shipped_stations())
+    assert {"demo", "grasped_pivoting", "extrinsic_pivoting", "calibrate"} <= set(shipped.experiments())
+    assert not {"targets", "paper_tables", "table_grasped"} & set(shipped.experiments())
+    assert {"sim", "emulated_lab", "example_lab"} <= set(shipped.stations())
 
 
-@pytest.mark.parametrize("experiment", shipped_experiments())
+@pytest.mark.parametrize("experiment", shipped.experiments())
 def test_the_copy_says_what_the_shipped_one_says_and_names_the_station_beside_it(experiment, tmp_path, monkeypatch):
     new_folder(tmp_path / "demo", experiment, "sim")
     monkeypatch.chdir(tmp_path / "demo")
@@ -35,7 +36,7 @@ def test_the_copy_says_what_the_shipped_one_says_and_names_the_station_beside_it
     assert contents(tmp_path / "demo") == MADE
 
 
-@pytest.mark.parametrize("station", shipped_stations())
+@pytest.mark.parametrize("station", shipped.stations())
 def test_its_files_fit_the_schemas_that_they_name(station, tmp_path):
     new_folder(tmp_path / "demo", "grasped_static", station)
     for name in ("experiment", "station"):

@@ -15,8 +15,8 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from drivers.station import listening
 from drivers.wire.log_reader import LogReader
+from drivers.wire.session import listening
 from experiments import runner
 from experiments.calibrate import store
 from experiments.calibrate.models import ElasticityCalibration
