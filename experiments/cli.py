@@ -228,6 +228,37 @@ def replay(
     raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, Console()))
 
 
+@command("extrinsic view runs/grasped_pivoting-20260101T120000.000000 --web")
+def view(
+    target: Annotated[
+        str | None,
+        typer.Argument(metavar="RUN|STATION", help="A run folder or its log.mcap, or a station that is being served."),
+    ] = None,
+    web: Annotated[bool, typer.Option("--web", help="In the browser, at 127.0.0.1, in place of a window.")] = False,
+    port: Annotated[
+        int | None,
+        typer.Option("--port", min=1, max=65534, help="The page's port, 9090; its data take the next one."),
+    ] = None,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Say the page's address; open no browser.")] = False,
+    save: Annotated[
+        Path | None, typer.Option("--save", metavar="FILE.rrd", help="Write it to a file for Rerun, and show nothing.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.1, help="Look at a live station for so long; until Ctrl-C.")
+    ] = None,
+    foxglove_layout: Annotated[
+        Path | None,
+        typer.Option("--foxglove-layout", metavar="FILE", help="Write the layout for Foxglove to FILE, and end."),
+    ] = None,
+    sets: Sets = None,
+) -> None:
+    """Look at a recorded run, or at a live station, in Rerun: scene, pictures, wrenches, estimates, events."""
+    from experiments.view import command as viewing
+
+    options = viewing.Options(web=web, port=port, browser=not no_browser, save=save, seconds=seconds)
+    viewing.main(target, sets or [], options, foxglove_layout, Console(stderr=True))
+
+
 @command("extrinsic bench sim --check")
 def bench(
     name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="sim, estimation, planning, load or bus.")],
