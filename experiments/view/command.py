@@ -76,7 +76,16 @@ def _station(target: str, sets: Sequence[str]) -> StationConfig:
     """The station that is meant. Raises InputError."""
     from experiments.files import load_station
 
-    return load_station(target, sets)
+    try:
+        return load_station(target, sets)
+    except InputError as error:
+        if Path(target).suffix in (".yaml", ".yml") or "no such" not in error.problems[0].wrong:
+            raise
+        there = error.problems[0].expected
+        wrong = "there is no such run folder, and no such station"
+        raise InputError(
+            [Problem(target, None, "RUN | STATION", wrong, f"a folder under runs/, or a station: {there}")]
+        ) from None
 
 
 def _station_name(target: str, sets: Sequence[str]) -> str:

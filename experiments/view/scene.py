@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from experiments.view import figures
 from experiments.view.figures import Colour
@@ -35,6 +36,7 @@ class Scene:
 
         self._rr, self._sheet = rr, sheet
         self._take(bodies)
+        self._drawn: dict[tuple[str, bool, bool], int] = {}
         self.root, self._plane = root, f"{root}/plane"
         self.box: tuple[float, float, float, float] | None = None
         sheet.once(self._plane, lambda: rr.Transform3D(mat3x3=np.diag([1.0, -1.0, 1.0])))
@@ -48,9 +50,7 @@ class Scene:
     def redraw(self, bodies: Bodies) -> None:
         """Other bodies stand on the table from now on."""
         self._take(bodies)
-        for source in figures.SOURCES:
-            for body in bodies.outlines:
-                self._sheet.still(f"{self._plane}/{source}/{body}/outline", self._outline(source, body))
+        self._drawn.clear()
 
     def state(self, source: str, at: At, state: PlanarState) -> None:
         """The bodies where ``source`` (one of `figures.SOURCES`) says that they are, and the wrench's force."""
@@ -67,10 +67,11 @@ class Scene:
         if not np.isfinite(pose).all() or (body != "ee" and body not in self._bodies.outlines):
             return
         path = f"{self._plane}/{source}/{body}"
-        self._sheet.once(f"{path}/outline", lambda: self._outline(source, body))
-        if source in ("truth", "measured"):
-            self._frame(path, body)
         self._sheet.pose(path, at, pose)
+        if self._is_new(path, at):  # not before it has been seen anywhere
+            self._sheet.log(f"{path}/outline", at, self._outline(source, body))
+            if source in ("truth", "measured") and body != "eo":
+                self._sheet.log(f"{path}/frame", at, self._frame(body))
         self._reach(body, pose)
 
     def contacts(self, source: str, at: At, contacts: Sequence[ContactTruth] | Sequence[Mapping[str, Any]]) -> None:
@@ -84,7 +85,7 @@ class Scene:
             at,
             len(told),
             positions=points,
-            colors=[_packed(colour) for colour in colours],
+            colors=_packed(colours),
             radii=[-4.0] * len(told),  # negative: of the screen
             labels=[mode for _, _, mode in told],
         )
@@ -100,7 +101,7 @@ class Scene:
             at,
             len(points),
             positions=points,
-            colors=[_packed(figures.SOURCES["estimated"])] * len(points),
+            colors=_packed([figures.SOURCES["estimated"]] * len(points)),
             radii=[-2.0 - 4.0 * float(weight) for weight in belief.weights],
             labels=[f"{weight:.0%}" for weight in belief.weights],
         )
@@ -119,16 +120,21 @@ class Scene:
         radius = -1.5 if source == "truth" else -0.8
         return self._rr.LineStrips2D([vertices], colors=[colour], radii=[radius])
 
-    def _frame(self, path: str, body: str) -> None:
-        frames = {"ee": ("", np.zeros(3)), "go": ("gocf", self._bodies.grasp)}
-        if body in frames:
-            name, pose = frames[body]
+    def _is_new(self, path: str, at: At) -> bool:
+        """Whether nothing was drawn there yet by this moment; a simulated station's time may begin again."""
+        line = (path, at.t_ns is None, at.waypoint is None)
+        now = at.waypoint if at.t_ns is None else at.t_ns
+        first = self._drawn.get(line)
+        if now is None or (first is not None and first <= now):
+            return False
+        self._drawn[line] = now
+        return True
 
-            def drawn() -> Any:
-                strips = [se2.transform(pose, axis) for axis in figures.axes()]
-                return self._rr.LineStrips2D(strips, colors=list(figures.AXES))
-
-            self._sheet.once(f"{path}/{name or body}_frame", drawn)
+    def _frame(self, body: str) -> Any:
+        """ee itself, and of the grasped object the object-sensor contact frame."""
+        pose = np.zeros(3) if body == "ee" else self._bodies.grasp
+        strips = [se2.transform(pose, axis) for axis in figures.axes()]
+        return self._rr.LineStrips2D(strips, colors=list(figures.AXES))
 
     def _forces(
         self, name: str, at: At, points: Sequence[Array], forces: Sequence[Array], colours: Sequence[Colour]
@@ -141,7 +147,7 @@ class Scene:
             len(sizes),
             origins=points,
             vectors=[figures.NEWTON * np.asarray(force) for force in forces],
-            colors=[_packed(colour) for colour in colours],
+            colors=_packed(colours),
             labels=[f"{size:.1f} N" for size in sizes],
         )
 
@@ -159,6 +165,6 @@ def _contact(contact: ContactTruth | Mapping[str, Any]) -> tuple[Array, Array, s
     return np.asarray(contact["point"]), np.asarray(contact["force"]), str(contact["mode"])
 
 
-def _packed(colour: Colour) -> int:
-    red, green, blue = colour
-    return red << 24 | green << 16 | blue << 8 | 0xFF
+def _packed(colours: Sequence[Colour]) -> NDArray[np.uint32]:
+    """Colours as 0xRRGGBBAA, for columns."""
+    return np.array([r << 24 | g << 16 | b << 8 | 0xFF for r, g, b in colours], np.uint32)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.errors import ProtocolError
 from drivers.finger_frames import DEPTH_UNIT
@@ -72,6 +73,7 @@ class Show:
         self.unreadable = 0
         self.sensors: set[str] = set()
         self.arms: set[str] = set()
+        self._depths: dict[str, tuple[float, float]] = {}
         self._scope = self._station()
         self._state: dict[str, Any] = {}
         self._takers: dict[type, Callable[[Any, str], None]] = {
@@ -266,7 +268,8 @@ class Show:
         at, rr = At(reading.stamp.capture_ns, self._next_step()), self._rr
         picture: Any
         if reading.encoding == "16UC1":
-            picture = rr.DepthImage(reading.image, meter=1.0 / DEPTH_UNIT, colormap="viridis")
+            shown = self._depths.setdefault(device, _depths(reading.image))
+            picture = rr.DepthImage(reading.image, meter=1.0 / DEPTH_UNIT, colormap="viridis", depth_range=shown)
         else:
             model = rr.ColorModel.L if reading.encoding == "mono8" else rr.ColorModel.BGR
             picture = rr.Image(reading.image, color_model=model)
@@ -278,3 +281,10 @@ class Show:
         labels = [str(tag.id) for tag in found]
         drawn = self._rr.LineStrips2D(strips, labels=labels, colors=[traces.TAG] * len(found))
         self._sheet.log(f"{self._image_path(device)}/tags", at, drawn)
+
+
+def _depths(image: NDArray[Any]) -> tuple[float, float]:
+    """The depths to show in colours: of the first picture, without the pixels that saw nothing."""
+    seen = image[image > 0]
+    low, high = np.percentile(seen, (0.5, 99.5)) if seen.size else (0.0, 1.0)
+    return float(low), max(float(high), float(low) + 1.0)

@@ -48,14 +48,7 @@ class Viewer:
         with ExitStack() as stack:
             settings = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="extrinsic-view-")))
             environment = quiet(settings)
-            subprocess.run(
-                [program, "analytics", "disable"],
-                env=environment,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                timeout=_START,
-                check=False,
-            )
+            switch_off(program, environment)
             data = _wanted(self._port + 1) if self.web else free_port()
             command = [str(program), "--bind", HOST, "--port", str(data)]
             source = free_port()
@@ -141,6 +134,19 @@ def quiet(settings: Path) -> dict[str, str]:
     if sys.platform == "darwin":
         own = {"HOME": str(settings)}
     return {**kept, **own, "CI": "1", "TELEMETRY_ENABLED": "false"}
+
+
+def switch_off(program: Path, environment: dict[str, str]) -> None:
+    """Switch the viewer's reports off in the settings that it has in ``environment``, by its own command.
+
+    Raises InputError.
+    """
+    command, quietly = [program, "analytics", "disable"], subprocess.DEVNULL
+    try:
+        subprocess.run(command, env=environment, stdout=quietly, stderr=quietly, timeout=_START, check=True)
+    except (OSError, subprocess.SubprocessError) as error:
+        wrong = f"its reports of use cannot be switched off, so it is not started: {error}"
+        raise InputError([Problem("view", None, "", wrong, "--save FILE, or another rerun-sdk")]) from None
 
 
 def _wanted(port: int) -> int:
