@@ -7,6 +7,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mechanics.readings import Array
 
@@ -36,7 +37,7 @@ class _Column:
         self.counts: list[int] = []
         self.fields: dict[str, list[Any]] = {}
 
-    def add(self, at: At, count: int, fields: dict[str, Sequence[Any] | Array]) -> None:
+    def add(self, at: At, count: int, fields: dict[str, Sequence[Any] | NDArray[Any]]) -> None:
         self.at.append(at)
         self.counts.append(count)
         for name, values in fields.items():
@@ -54,7 +55,7 @@ class Sheet:
         self._columns: dict[tuple[str, str, bool, bool], _Column] = {}
         self._noted: set[str] = set()
 
-    def put(self, path: str, archetype: Any, at: At, count: int, **fields: Sequence[Any] | Array) -> None:
+    def put(self, path: str, archetype: Any, at: At, count: int, **fields: Sequence[Any] | NDArray[Any]) -> None:
         """Add a row of ``count`` instances at ``path``; each field has one value per instance."""
         key = (path, archetype.__name__, at.t_ns is None, at.waypoint is None)
         column = self._columns.get(key)
