@@ -27,6 +27,15 @@ PORT = 9090
 """Of the web page; its data go over the next one."""
 
 _START, _END = 30.0, 5.0
+
+# the program ends with this process, even where this one is killed: the kernel's signal outlives an exec
+_BIND = """\
+import ctypes, os, signal, sys
+ctypes.CDLL(None).prctl(1, signal.SIGTERM, 0, 0, 0)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+BOUND = [sys.executable, "-I", "-S", "-c", _BIND] if sys.platform == "linux" else []
+"""What stands before a command that is to end with this process."""
 _STEP = 0.05
 
 
@@ -59,7 +68,7 @@ class Viewer:
             page = stack.enter_context(Page(self._port, source, data)) if self.web else None
             stack.callback(self._stop)
             self._process = subprocess.Popen(
-                command,
+                [*BOUND, *command],
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,

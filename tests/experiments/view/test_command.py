@@ -1,6 +1,11 @@
 """What `extrinsic view` is asked that cannot be: each with what to do, and exit code 2 or 3."""
 
+import json
+import os
+import select
 import socket
+import subprocess
+import sys
 
 import pytest
 from typer.testing import CliRunner
@@ -83,10 +88,24 @@ def test_the_policy_names_this_machine_only():
     assert {word for word in sources if "://" in word} == {"http://127.0.0.1:4711", "http://localhost:4711"}
 
 
-def test_the_viewers_reports_are_off_and_the_users_settings_are_not_touched(monkeypatch, tmp_path):
-    import json
-    import subprocess
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the kernel has no such signal")
+def test_the_viewer_ends_with_who_started_it_even_where_that_is_killed():
+    held, kept = os.pipe()  # the program holds the writing end, and tells through it when it is there
+    there = f"import os, signal; os.write({kept}, b'x'); signal.pause()"
+    program = [*viewer.BOUND, sys.executable, "-c", there]
+    script = f"import subprocess, sys; subprocess.Popen({program!r}, pass_fds=[{kept}]); sys.stdin.read()"
+    owner = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, pass_fds=[kept])
+    os.close(kept)
+    try:
+        assert select.select([held], [], [], 30)[0] and os.read(held, 1) == b"x"
+    finally:
+        owner.kill()
+        owner.communicate(timeout=10)
+    assert select.select([held], [], [], 30)[0] and os.read(held, 1) == b""  # nobody holds it any more
+    os.close(held)
 
+
+def test_the_viewers_reports_are_off_and_the_users_settings_are_not_touched(monkeypatch, tmp_path):
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     home = tmp_path / "home"
     home.mkdir()
