@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from experiments import __version__, authoring, completion, kernels
+from experiments import __version__, authoring, completion, kernels, station_commands
 from experiments.command import (
     Benchmark,
     CheckTargets,
@@ -19,7 +19,6 @@ from experiments.command import (
     Run,
     Scheduler,
     Sets,
-    StationName,
     StationOption,
     TableName,
     commands,
@@ -41,6 +40,7 @@ app = typer.Typer(
 
 command = commands(app)
 app.add_typer(lab)
+app.add_typer(station_commands.app)
 app.add_typer(authoring.app)
 
 
@@ -125,123 +125,6 @@ def check(experiment: Experiment, station: StationOption = None, sets: Sets = No
     dry_run(experiment, station, sets or [], json_file)
 
 
-@command("extrinsic serve sim --set world.clock=realtime")
-def serve(
-    station: StationName,
-    devices: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="DEVICE",
-            help="Serve only these devices; all by default.",
-            autocompletion=completion.devices,
-        ),
-    ] = None,
-    sets: Sets = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Listen without keys where other machines can reach it.")
-    ] = False,
-) -> None:
-    """Put a station's devices on the bus, until Ctrl-C."""
-    from experiments.files import load_station
-    from experiments.serve import serve as serve_station
-
-    raise typer.Exit(serve_station(load_station(station, sets or [], devices or None), insecure=insecure))
-
-
-@command("extrinsic emulate emulated_lab")
-def emulate(station: StationName, sets: Sets = None) -> None:
-    """Start an emulated lab: a simulated plant behind devices that the real backends speak to, until Ctrl-C."""
-    from experiments.files import load_station
-    from experiments.serve import emulate as emulate_lab
-
-    raise typer.Exit(emulate_lab(load_station(station, sets or [])))
-
-
-@command("extrinsic status sim --watch")
-def status(
-    station: StationName,
-    watch: Annotated[
-        bool, typer.Option("--watch", help="Go on showing it until q or Ctrl-C; a plain line per device in a file.")
-    ] = False,
-    interval: Annotated[
-        float | None,
-        typer.Option(
-            "--interval", metavar="SECONDS", min=0.1, max=3600, help="How often --watch shows it: 0.5; 10 in a file."
-        ),
-    ] = None,
-    json_file: JsonFile = None,
-    sets: Sets = None,
-) -> None:
-    """Show every device of a station: alive, rate, age, lost readings, who commands it, what stopped it."""
-    from experiments import status as telling
-    from experiments.files import load_station
-    from mechanics.yaml_input import InputError, Problem
-
-    config = load_station(station, sets or [])
-    if not watch and interval is not None:
-        raise InputError([Problem("status", None, "--interval", "there is one look without --watch", "--watch")])
-    raise typer.Exit(telling.watch(config, interval, json_file) if watch else telling.once(config, json_file))
-
-
-@command("extrinsic stop sim")
-def stop(station: StationName, sets: Sets = None) -> None:
-    """Stop a station's arm now; it stays stopped until `recover`. Needs no lease, and no run's consent."""
-    from drivers.safety import stop as stop_arms
-    from experiments.files import load_station
-
-    for arm in stop_arms(load_station(station, sets or [])):
-        terminal().print(f"{arm.name} is stopped: {arm.reason}", soft_wrap=True, highlight=False)
-
-
-@command("extrinsic recover sim")
-def recover(station: StationName, sets: Sets = None) -> None:
-    """Release a latched stop, once its reason is gone; nothing moves by that."""
-    from drivers.safety import recover as recover_arms
-    from experiments.files import load_station
-
-    for arm in recover_arms(load_station(station, sets or [])):
-        said = f"was stopped: {arm.reason}; it takes set-points again" if arm.reason else "was not stopped"
-        terminal().print(f"{arm.name} {said}", soft_wrap=True, highlight=False)
-
-
-@command("extrinsic check-device lab1.yaml wrist_ft", name="check-device")
-def check_device(
-    station: StationName,
-    device: Annotated[
-        str,
-        typer.Argument(
-            metavar="DEVICE", help="The device's name in the station file.", autocompletion=completion.devices
-        ),
-    ],
-    step: Annotated[
-        list[str] | None, typer.Option("--step", metavar="STEP", help="Take this step only; may be repeated.")
-    ] = None,
-    move: Annotated[bool, typer.Option("--move", help="Let it move: an arm 5 mm, a gripper open and close.")] = False,
-    reference: Annotated[
-        Path | None,
-        typer.Option("--reference", metavar="FILE", help="Take a finger's picture, untouched, into FILE (PNG)."),
-    ] = None,
-    yes: Annotated[
-        bool, typer.Option("--yes", help="Ask nobody: agree to what is asked for, leave out what needs a hand.")
-    ] = False,
-    json_file: JsonFile = None,
-    sets: Sets = None,
-) -> None:
-    """Walk through the bring-up of one device: what to look at, what is measured, what it is worth."""
-    from experiments.check_device.checklist import check_device as walk_through
-    from experiments.check_device.person import whoever_is_here
-    from experiments.files import load_station
-
-    load_station(station, sets or [], [device])  # refuses one that the station has not
-    config, console = load_station(station, sets or []), beside(json_file)
-    person = whoever_is_here(console, yes=yes)
-    steps = tuple(step or ())
-    code = walk_through(
-        config, device, person, console, move=move, reference=reference, only=steps, json_file=json_file
-    )
-    raise typer.Exit(code)
-
-
 @command("extrinsic report runs/grasped_pivoting-20260101T120000.000000")
 def report(
     run_folder: Run,
@@ -279,6 +162,37 @@ def replay(
     from experiments.run_folder import RunFolder
 
     raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, beside(json_file)))
+
+
+@command("extrinsic view runs/grasped_pivoting-20260101T120000.000000 --web")
+def view(
+    target: Annotated[
+        str | None,
+        typer.Argument(metavar="RUN|STATION", help="A run folder or its log.mcap, or a station that is being served."),
+    ] = None,
+    web: Annotated[bool, typer.Option("--web", help="In the browser, at 127.0.0.1, in place of a window.")] = False,
+    port: Annotated[
+        int | None,
+        typer.Option("--port", min=1, max=65534, help="The page's port, 9090; its data take the next one."),
+    ] = None,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Say the page's address; open no browser.")] = False,
+    save: Annotated[
+        Path | None, typer.Option("--save", metavar="FILE.rrd", help="Write it to a file for Rerun, and show nothing.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.1, help="Look at a live station for so long; until Ctrl-C.")
+    ] = None,
+    foxglove_layout: Annotated[
+        Path | None,
+        typer.Option("--foxglove-layout", metavar="FILE", help="Write the layout for Foxglove to FILE, and end."),
+    ] = None,
+    sets: Sets = None,
+) -> None:
+    """Look at a recorded run, or at a live station, in Rerun: scene, pictures, wrenches, estimates, events."""
+    from experiments.view import command as viewing
+
+    options = viewing.Options(web=web, port=port, browser=not no_browser, save=save, seconds=seconds)
+    viewing.main(target, sets or [], options, foxglove_layout, terminal(stderr=True))
 
 
 @command("extrinsic bench sim --check")

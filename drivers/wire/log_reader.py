@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from mcap.records import Attachment, Channel, DataEnd, Footer, McapRecord, Message, Schema, Statistics
+from mcap.records import Attachment, Channel, DataEnd, Footer, Header, McapRecord, Message, Schema, Statistics
 
 from drivers.errors import ProtocolError
 from drivers.wire import log_records, messages
@@ -104,6 +104,11 @@ class LogReader:
         for logged in self.messages(topics):
             if logged.type_name in _READINGS or logged.type_name in _RECORDS:
                 yield logged.topic, logged.value()
+
+    def library(self) -> str | None:
+        """The program that wrote the file; None where it breaks off before it says so. Our logs say ``extrinsic``."""
+        first = next(self.records(), None)
+        return first.library if isinstance(first, Header) else None
 
     def attachments(self) -> dict[str, bytes]:
         """The files in the log, by name."""

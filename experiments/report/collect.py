@@ -240,7 +240,7 @@ def _waypoints(trial: LoggedTrial, start_ns: int) -> dict[str, Any]:
     contacts: list[list[dict[str, Any]]] = [[] for _ in points]
     plan = plan_of(trial)
     if plan is not None:
-        contacts = [_planned_contacts(plan, point.step) for point in points]
+        contacts = [planned_contacts(plan, point.step) for point in points]
     return {
         "t": [(point.capture_ns - start_ns) * SECOND for point in points],
         "planned": _states(point.planned for point in points),
@@ -252,15 +252,18 @@ def _waypoints(trial: LoggedTrial, start_ns: int) -> dict[str, Any]:
 
 def plan_of(trial: LoggedTrial) -> Plan | None:
     """The plan that a trial executed; None where it was torn off, or made by a version that wrote plans otherwise."""
-    if trial.end is None or not trial.end.plan:
-        return None
+    return None if trial.end is None else plan_in(trial.end)
+
+
+def plan_in(end: TrialRecord) -> Plan | None:
+    """As `plan_of`, from the record of a trial's end."""
     try:
-        return Plan.from_dict(json.loads(trial.end.plan))
+        return Plan.from_dict(json.loads(end.plan)) if end.plan else None
     except (ValueError, RecursionError):
         return None
 
 
-def _planned_contacts(plan: Plan, step: int) -> list[dict[str, Any]]:
+def planned_contacts(plan: Plan, step: int) -> list[dict[str, Any]]:
     """The planned contacts at a step, forces in W: f_n along the normal, f_t along the normal turned by −90°."""
     out = []
     for c, name in enumerate(plan.contact_names):
