@@ -117,7 +117,10 @@ class Panel(_Model):
 
 
 class Comparison(_Model):
-    """``a`` − ``b`` in a figure, over pairs of trials alike in trajectory and number, for each value of ``each``.
+    """``a`` − ``b`` in a figure, for each value of ``each``, over pairs of trials of one number.
+
+    The trials of a pair are alike in every tag but those that ``a`` or ``b`` sets, and those that follow from them: the
+    run, where a's trials are of other runs than b's.
 
     The ``judged`` one of mean, ``upper`` and ``lower`` end of its 95 % interval is held against the target. A target of
     at most 0 is met by the upper end where a is surely not above b, and by the lower end even where nobody can tell:
@@ -209,7 +212,7 @@ class Table(_Model):
 
     @model_validator(mode="after")
     def _tags_are_given(self) -> Table:
-        given = {*ALWAYS, *(tag for run in self.runs for tag in run.tags)}
+        given = self.tags
         for key in ("panels", "comparisons", "counts", "figures"):
             for i, entry in enumerate(getattr(self, key)):
                 for name in _tag_fields(entry):
@@ -218,6 +221,11 @@ class Table(_Model):
                             wrong = f"no run has the tag {tag!r}"
                             raise Refusal(wrong, one_of(given), nearest(tag, given), at=(key, i, name))
         return self
+
+    @property
+    def tags(self) -> tuple[str, ...]:
+        """Every tag that tells trials of this table apart, each once."""
+        return tuple(dict.fromkeys((*ALWAYS, *(tag for run in self.runs for tag in run.tags))))
 
     def controllers_of(self, run: RunEntry) -> tuple[str, ...]:
         """Its own, or the table's."""

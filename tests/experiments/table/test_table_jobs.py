@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from experiments.files import load
-from experiments.table import jobs
+from experiments.table import aggregate, jobs
+from experiments.table.aggregate import Data
 from experiments.table.jobs import Options
 from mechanics.yaml_input import InputError
 from planning.errors import InfeasiblePlan
@@ -90,6 +92,22 @@ def test_calibrations_come_in_the_order_in_which_they_need_each_other(table):
     phases = jobs.calibration_phases(table, table.runs)
     assert [[entry.name for entry in phase] for phase in phases] == [["hand"], ["rough"]]
     assert jobs.calibration_phases(table, [run for run in table.runs if run.calibration is None]) == []
+
+
+@pytest.mark.parametrize(("name", "pairs"), [("grasped", 8), ("extrinsic", 3), ("pivoting", 3), ("optimizers", 5)])
+def test_the_papers_comparisons_have_a_pair_for_each_trial_of_a_run(name, pairs):
+    """8 grasps of a skill; 3 trajectories of a skill or shape; 5 optimisations of an optimiser, on each sensor."""
+    table = jobs.load_table(name)[0]
+    asked = [job for run in table.runs for job in jobs.run_jobs_of(table, run, Options(), None)]
+    rows = [
+        {**job.tags, "controller": law, "trial": job.trial, "status": "completed"}
+        for job in asked
+        for law in job.controllers
+    ]
+    trials = pd.DataFrame(rows).assign(**{f"measured.{name}.mean": 0.5 for name in ("wrench_N", "eo_pose_mm")})
+    aggregate.refuse_doubles(table, trials)
+    found = [one for entry in table.comparisons for one in aggregate._compared(table, entry, Data(trials, trials))]
+    assert found and {one.told.rpartition(", ")[2] for one in found} == {f"{pairs} of {pairs} pairs"}
 
 
 def test_the_run_whose_plans_are_executed_runs_too():
