@@ -165,6 +165,12 @@ def _await_worker(client: Client) -> None:
         raise NotConnected("this machine", asked, got, "Ask for fewer `--workers`, or free some memory") from None
 
 
+def reach(scheduler: str) -> None:
+    """Raises InputError, within a bounded time, where ``scheduler`` does not answer or has no worker."""
+    with _remote(scheduler):
+        pass
+
+
 @contextmanager
 def _remote(scheduler: str) -> Iterator[Client]:
     """A client of a scheduler that answers and has a worker. Raises InputError within a bounded time."""

@@ -160,9 +160,9 @@ class CampaignFolder:
         stages = resolved.experiment.stages
         source = store.folder_of(resolved)
         if any(stage.stage.startswith("calibrate") for stage in stages):
-            sets.append(_set("calibration.source", _copied(source, folder.path / "calibrations")))
+            sets.append(_set("calibration.source", copied(source, folder.path / "calibrations")))
         elif resolved.experiment.calibration.source != "none" and source.is_dir():
-            sets.append(_set("calibration.source", _copied(source, self.path / "calibrations" / source.name)))
+            sets.append(_set("calibration.source", copied(source, self.path / "calibrations" / source.name)))
         elif resolved.experiment.calibration.source == "auto":
             sets.append(_set("calibration.source", "none"))  # what others calibrate meanwhile is not of this campaign
         plans = plan_files(resolved)
@@ -179,7 +179,7 @@ def _set(key: str, value: object) -> str:
     return f"experiment.{key}={json.dumps(str(value))}"
 
 
-def _copied(source: Path, target: Path) -> Path:
+def copied(source: Path, target: Path) -> Path:
     """``target``, a copy of the files in ``source`` made once, at once; an empty folder where there is no source."""
     if not target.exists():
         aside = target.with_name(f".{target.name}")

@@ -22,6 +22,8 @@ from mechanics.yaml_input import InputError, Problem
 
 MEASURED, TRUTH = "measured", "truth"
 _COMPONENTS = ("fx_N", "fy_N", "tau_Nmm", "x_mm", "y_mm")
+#: how a trial may end that has come to a result, if not to its end
+_RESULTS = ("slipped", "lost_contact")
 
 Pair = tuple[Any, ...]
 
@@ -58,6 +60,20 @@ def picked(frame: pd.DataFrame, where: Mapping[str, Any]) -> pd.DataFrame:
 def completed(trials: pd.DataFrame) -> int:
     """How many trials were completed."""
     return int(np.count_nonzero(trials["status"].to_numpy() == "completed")) if len(trials) else 0
+
+
+def fell_short(table: Table, trials: pd.DataFrame) -> pd.DataFrame:
+    """The trials that were not completed, and are to be.
+
+    One that slips or loses its contact has had its result: it is held against the table where one of its counts of
+    completed trials picks it.
+    """
+    missing = trials.loc[trials["status"] != "completed"]
+    held = ~missing["status"].isin(_RESULTS)
+    for entry in table.counts:
+        if entry.of == "trials completed":
+            held |= missing.index.isin(picked(missing, entry.where).index)
+    return missing.loc[held]
 
 
 def combinations(frame: pd.DataFrame, tags: Sequence[str]) -> list[dict[str, Any]]:

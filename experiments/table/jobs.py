@@ -12,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from experiments.calibrate import store
 from experiments.calibrate.store import Calibrations
 from experiments.campaign.jobs import InfeasibleJob
 from experiments.check import check
@@ -193,10 +194,18 @@ def check_first(table: Table, runs: Sequence[RunEntry], options: Options) -> Non
 
     All that before anything is started. Raises InputError, and InfeasiblePlan where there is no plan.
     """
+    _refuse_more_trials(table, runs, options)
+    left: dict[str | None, set[str]] = {None: set()}
     for entry in (entry for phase in calibration_phases(table, runs) for entry in phase):
         sets = _calibrating(table, entry, options, None)
         with _told_of(f"calibration {entry.name}"):
-            check(load(entry.experiment, entry.station, sets), Calibrations())
+            resolved = load(entry.experiment, entry.station, sets)
+            made = store.made_by(resolved)
+            if not made:
+                wrong = f"{entry.experiment} has no stage that calibrates"
+                raise InputError([_problem(table, "calibrations", entry.name, wrong, "`calibrate_…` stages")])
+            check(resolved, Calibrations())
+        left[entry.name] = left[entry.after] | made
     trials: list[dict[str, Any]] = []
     for run in runs:
         controllers = table.controllers_of(run)
@@ -205,10 +214,26 @@ def check_first(table: Table, runs: Sequence[RunEntry], options: Options) -> Non
             with _told_of(f"run {run.name}, trajectory {trajectory.name}"):
                 resolved, _ = _resolved(table, run, trajectory, sets, controllers)
                 check(resolved, Calibrations())
+            if run.calibration is not None and not left[run.calibration].intersection(store.wanted(resolved)):
+                wrong = f"nothing that {run.calibration} finds is of this run's sensor, objects or devices"
+                raise InputError([_problem(table, "runs", run.name, wrong, "one that is, or no `calibration`")])
             tags = _tags(run, trajectory, resolved)
             numbers = _numbers(table, run, n, options)
             trials += [{**tags, "controller": name, "trial": number} for number in numbers for name in controllers]
     refuse_doubles(table, pd.DataFrame(trials))
+
+
+def _problem(table: Table, key: str, name: str, wrong: str, expected: str) -> Problem:
+    return Problem(f"table {table.name}", None, f"{key}.{name}", wrong, expected)
+
+
+def _refuse_more_trials(table: Table, runs: Sequence[RunEntry], options: Options) -> None:
+    """``--trials`` makes a part of the table, never more than the table."""
+    most = max(table.trials_of(run) for run in runs)
+    if options.trials is not None and options.trials > most:
+        wrong = f"{options.trials} are more than there are: {most} of each trajectory"
+        expected = f"at most {most}; more are made by --set table.trials={options.trials}"
+        raise InputError([Problem(f"table {table.name}", None, "--trials", wrong, expected)])
 
 
 @contextmanager

@@ -129,6 +129,32 @@ def test_a_key_that_does_not_exist_is_refused_with_run_and_trajectory(small):
         jobs.check_first(table, table.runs, Options())
 
 
+def test_a_calibration_that_does_not_calibrate_is_refused(small):
+    small.write_text(SMALL.replace("name: hand\n", "name: hand\n    experiment: grasped_static\n", 1).replace(
+        "    set: {stages: [{stage: calibrate_clock}]}\n", "", 1
+    ))  # fmt: skip
+    table = jobs.load_table(str(small))[0]
+    with pytest.raises(InputError, match=r"calibrations\.hand: grasped_static has no stage that calibrates"):
+        jobs.check_first(table, table.runs, Options())
+
+
+def test_a_run_that_can_use_nothing_of_its_calibration_is_refused(small):
+    """The friction of one object tells nothing of another's."""
+    small.write_text(
+        SMALL.replace("{stage: calibrate_clock}", "{stage: calibrate_friction, pair: go-eo}")
+        .replace("pair: go-ground}]}", "pair: eo-ground}]}")
+        .replace("tags: {skill: static}\n", "tags: {skill: static}\n    set: {extrinsic_object: pentagon}\n", 1)
+    )
+    table = jobs.load_table(str(small))[0]
+    with pytest.raises(InputError, match=r"runs\.static: nothing that rough finds is of this run's"):
+        jobs.check_first(table, table.runs, Options())
+
+
+def test_more_trials_than_the_table_has_are_refused_with_what_makes_more(table):
+    with pytest.raises(InputError, match=r"--trials: 3 are more .*: 2 of each(.|\n)*--set table\.trials=3"):
+        jobs.check_first(table, table.runs, Options(trials=3))
+
+
 def test_a_task_without_a_plan_is_refused_with_run_and_trajectory(small):
     small.write_text(SMALL.replace("angle_deg: 20", "tangential: 3"))
     table = jobs.load_table(str(small))[0]
