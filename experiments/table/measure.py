@@ -208,7 +208,12 @@ def _refusal(job: Asked) -> str | None:
 def _outcomes(asked: Sequence[Asked], engine: Engine, folder: Path, console: Console) -> Sequence[JobOutcome]:
     told = [
         Job(
-            job.id, job.experiment, job.station, job.all_sets, {key: job.tags.get(key) for key in ("run", "trajectory")}
+            job.id,
+            job.experiment,
+            job.station,
+            job.all_sets,
+            {key: job.tags.get(key) for key in ("run", "trajectory")},
+            home=folder.parent,  # the table's, with what was calibrated and planned for these jobs
         )
         for job in asked
     ]

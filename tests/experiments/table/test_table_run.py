@@ -38,6 +38,7 @@ def test_calibrations_run_first_and_each_run_believes_its_own(made, small, out):
     assert sources["calibration-rough"] == str(shelf / "hand")
     assert sources["static-a-0"] == str(shelf / "rough")
     assert sources["slow-a-0"] == str(shelf / "none")  # it names none
+    assert {job.home for _, campaign in made.campaigns for job in campaign} == {out}  # a table may be moved
     assert "found-by-calibration-rough.yaml" in {file.name for file in (shelf / "rough").iterdir()}
 
 
