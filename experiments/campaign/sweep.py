@@ -73,6 +73,9 @@ def _conclude(folder: Path, code: ExitCode, json_file: Path | None, console: Con
         return True  # it was interrupted before anything was started
     summary, trials = _summary(campaign, code)
     console.print(frame.summary_table(f"sweep of {summary['experiment']}", summary["cells"]))
+    differences = frame.comparison_table(summary["comparisons"])
+    if differences.row_count:
+        console.print(differences)
     for job in summary["failed"]:
         said.print(f"{job['id']}: {job['reason']}", style="red", highlight=False, markup=False, soft_wrap=True)
     try:
@@ -104,5 +107,6 @@ def _summary(campaign: CampaignFolder, code: ExitCode) -> tuple[dict[str, Any], 
         "failed": failed,
         "trials": len(trials),
         "cells": frame.cells(campaign.path, trials),
+        "comparisons": frame.comparisons(campaign.path, trials),
     }
     return summary, trials
