@@ -13,6 +13,7 @@ from control.motion import PEAK
 from drivers.config import ArmConfig, ForceTorqueConfig, TactileConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
+from experiments import view
 from experiments.calibrate.schema import CameraStage, FrictionStage
 from experiments.calibrate.store import Calibrations, load
 from experiments.faults.schema import FaultsStage
@@ -47,13 +48,15 @@ def check(
     problems = _device_problems(resolved) + _scene_problems(resolved)
     if problems:
         raise InputError(problems)
-    made = tasks(resolved, believed(resolved, calibrations), feasible)
+    known = believed(resolved, calibrations)
+    made = tasks(resolved, known, feasible)
     plans = plan_files(resolved, own)
     problems = [
         problem
         for eo in {*map(resting_eo, made.values()), *map(_resting_of_plan, plans.values())} - {None}
         for problem in _scene_problems(resolved, eo)
     ]
+    problems = problems or view.problems(resolved, known, made, plans)
     if problems:
         raise InputError(problems)
     experiment, station = resolved.experiment, resolved.station

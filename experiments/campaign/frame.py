@@ -116,7 +116,7 @@ def _difference(a: pd.DataFrame, b: pd.DataFrame, column: str) -> dict[str, Any]
     if column not in a:
         return None
     known = [side.dropna(subset=[column]).set_index(_PAIR)[column].astype(float).to_dict() for side in (a, b)]
-    found = paired_over(*known)
+    found = paired_over(known[0], known[1])
     return None if found is None else {"mean": found.mean, "low": found.low, "high": found.high, "n": found.n}
 
 
