@@ -175,7 +175,7 @@ def summary_table(title: str, found: list[dict[str, Any]]) -> Table:
 def comparison_table(found: list[dict[str, Any]]) -> Table:
     """The differences between controllers for a terminal, those of two pairs and more."""
     told = [one for one in found if any(figure and figure["n"] > 1 for figure in one["measured"].values())]
-    title = "Differences over pairs of trials of one seed and number, and their 95 % intervals"
+    title = "Differences over pairs of trials of one seed and number, with 95 % intervals"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
     keys = list(dict.fromkeys(key for one in told for key in one["cell"]))
     skills = ["skill"] if len({one["skill"] for one in told}) > 1 else []
@@ -199,7 +199,7 @@ def comparison_table(found: list[dict[str, Any]]) -> Table:
 def _interval(figure: Mapping[str, Any] | None) -> str:
     if figure is None or figure["low"] is None:
         return "–"
-    return f"{figure['mean']:+.3f} ({figure['low']:+.3f}…{figure['high']:+.3f})"
+    return f"{figure['mean']:+.3f}\n{figure['low']:+.3f}…{figure['high']:+.3f}"
 
 
 def _shown(value: Any) -> str:
