@@ -6,6 +6,7 @@ Every trial of every skill and controller runs through here, on the simulated st
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,8 +32,8 @@ from planning.plan import Plan
 class TrialResult:
     """How a trial ended (statuses of design §6) and what it recorded. ``plan`` is the plan as anchored.
 
-    ``witness`` is what the sensor under the table said of the wrist's force, at the waypoints where it said anything.
-    ``deviation`` is the first that the law did not take in.
+    ``device`` is the one that failed. ``witness`` is what the sensor under the table said of the wrist's force, at the
+    waypoints where it said anything. ``deviation`` is the first that the law did not take in.
     """
 
     status: str
@@ -41,6 +42,7 @@ class TrialResult:
     waypoints: list[WaypointRecord] = field(default_factory=list)
     witness: list[Agreement] = field(default_factory=list)
     deviation: Deviation | None = None
+    device: str = ""
 
 
 @dataclass
@@ -86,7 +88,7 @@ class Trial:
         self._mover = Mover.of(observer.arm, clock, observer.arm_pose(), settings, watch.tick)
 
     def run(self) -> TrialResult:
-        """Run the whole protocol. Returns how it ended.
+        """Run the whole protocol. Returns how it ended; where anything failed, the arm is held.
 
         A device failure ends it ``device_failed``, a refusal or a limit ``stopped``, and a simulation whose state has
         become nonsense ``diverged``.
@@ -102,7 +104,10 @@ class Trial:
         except SimulationDiverged as error:
             result.status, result.reason = "diverged", str(error)
         except DriverError as error:
-            result.status, result.reason = "device_failed", str(error)
+            result.status, result.reason, result.device = "device_failed", str(error), error.device
+        if result.status in ("stopped", "diverged", "device_failed"):
+            with suppress(DriverError):  # one that does not answer is held by its server
+                self._observer.arm.hold()
         if result.status != "completed":
             self._watch.event("error", f"{result.status}: {result.reason}")
         return result

@@ -13,7 +13,7 @@ from control.motion import PEAK
 from drivers.config import ArmConfig, ForceTorqueConfig, TactileConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
-from experiments import view
+from experiments import disk, view
 from experiments.calibrate.schema import CameraStage, FrictionStage
 from experiments.calibrate.store import Calibrations, load
 from experiments.faults.schema import FaultsStage
@@ -48,6 +48,7 @@ def check(
     problems = _device_problems(resolved) + _scene_problems(resolved)
     if problems:
         raise InputError(problems)
+    disk.require_store(resolved)
     known = believed(resolved, calibrations)
     made = tasks(resolved, known, feasible)
     plans = plan_files(resolved, own)

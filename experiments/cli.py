@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from experiments import kernels
+from experiments import __version__, authoring, kernels
 from experiments.command import Sets, StationName, commands
 from experiments.exit_codes import ExitCode
 from experiments.lab.commands import app as lab
@@ -27,6 +27,23 @@ app = typer.Typer(
 
 command = commands(app)
 app.add_typer(lab)
+app.add_typer(authoring.app)
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"extrinsic {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
 
 Experiment = Annotated[str, typer.Argument(metavar="EXPERIMENT", help="An experiment file, or a shipped one's name.")]
 StationOption = Annotated[

@@ -154,9 +154,11 @@ def _stages(
         context = RunContext(resolved, calibrations, folder, results, log, progress, closing, ask, heed, host)
         code, reason = _carried_out(context, interrupt)
         cut_off = code is ExitCode.DEVICE_FAILED
+        interrupt.closing()
     except KeyboardInterrupt:
         code, reason = ExitCode.INTERRUPTED, INTERRUPTED
     except Exception as error:  # whatever it is: the arm is held, the log is closed, and the results say so
+        interrupt.closing()
         code, reason = _ended_by(error, folder)
     interrupt.closing()
     if context is not None:

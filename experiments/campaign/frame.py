@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -35,9 +35,17 @@ def trials_frame(folder: Path) -> pd.DataFrame:
     campaign = CampaignFolder(folder)
     jobs = campaign.read()["jobs"]
     rows = [row for job in jobs for row in _rows(campaign.path, campaign.job(job["id"]), job)]
+    return frame_of(rows, leading=("job", "run"))
+
+
+def frame_of(rows: Sequence[Mapping[str, Any]], leading: Sequence[str] = ()) -> pd.DataFrame:
+    """Rows of results.json as a table: their figures as ``measured.wrench_N.mean`` and so on.
+
+    Without any row it has the columns that every row has, those in ``leading`` first.
+    """
     if not rows:
-        return pd.DataFrame(columns=["job", "run", *METHOD, "trial", "status", "reason"])
-    frame = pd.json_normalize(rows, sep=".")
+        return pd.DataFrame(columns=[*leading, *METHOD, "trial", "status", "reason"])
+    frame = pd.json_normalize([dict(row) for row in rows], sep=".")
     nested = {name for name in frame if any(other.startswith(f"{name}.") for other in frame)}
     frame = frame.drop(
         columns=[name for name in nested if not frame[name].dropna().size]

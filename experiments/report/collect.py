@@ -146,16 +146,14 @@ def _nominal(resolved: Resolved) -> list[dict[str, Any]]:
 def read_logs(folder: RunFolder, rate: float) -> Logs:
     """One pass over the logs of a run; truth is thinned to ``rate`` [Hz] on the way.
 
-    The last trial of a log is left out where the next log begins with it again: the run went on with it.
+    Of a trial that was run again, in the same log or in that of the run that went on, the last attempt counts.
     """
     log = Logs()
     for file in folder.logs():
-        log.current, begun = None, len(log.trials)
+        log.current = None
         ending = _read(file, log, rate)
         if log.ending in ("complete", "there is no log"):
             log.ending = ending
-        if 0 < begun < len(log.trials) and log.trials[begun].begin.trial == log.trials[begun - 1].begin.trial:
-            del log.trials[begun - 1]
     return log
 
 
@@ -194,6 +192,8 @@ def _file(log: Logs, value: object) -> None:
             current.end, log.current = value, None
         elif not value.status:
             log.current = LoggedTrial(value)
+            if log.trials and log.trials[-1].begin.trial == value.trial:
+                log.trials.pop()
             log.trials.append(log.current)
     elif current is None:
         return

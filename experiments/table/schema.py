@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from experiments import registries
 from experiments.planning.schema import Slug
+from mechanics.json_schema import Offered
 from mechanics.yaml_input import Refusal, nearest, one_of
 
 #: what a figure may be: one of design §6's (of every trial), a summary of the paper's Table 3, or a plan's
@@ -73,10 +74,10 @@ def _known_controllers(names: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
-Figure = Annotated[str, AfterValidator(_known_figure)]
-TrialFigure = Annotated[str, AfterValidator(_of_trials)]
-Figures = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_known_figures)]
-Controllers = Annotated[tuple[str, ...], AfterValidator(_known_controllers)]
+Figure = Annotated[str, AfterValidator(_known_figure), Offered(lambda: HEADINGS)]
+TrialFigure = Annotated[str, AfterValidator(_of_trials), Offered(lambda: ERRORS)]
+Figures = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_known_figures), Offered(lambda: HEADINGS)]
+Controllers = Annotated[tuple[str, ...], AfterValidator(_known_controllers), Offered(registries.controllers)]
 
 
 class CalibrationEntry(_Model):
