@@ -21,6 +21,7 @@ from pydantic_core import CoreSchema
 from drivers.fault import Fault
 from drivers.registry import OURS, driver, names
 from drivers.scene import Strict, TagMount, Vector3
+from mechanics.camera import CameraModel
 from mechanics.json_schema import Offered, Schema, reference, when
 from mechanics.yaml_input import Refusal, nearest, one_of, validated
 
@@ -220,6 +221,11 @@ class TagCameraConfig(DeviceConfig, frozen=True):
     focal: float = Field(default=1400.0, gt=0, description="focal length [px]")
     position: Vector3
     look_at: Vector3
+
+    @property
+    def model(self) -> CameraModel:
+        """The camera as it is described here. Raises ValueError where it looks nowhere, or straight up or down."""
+        return CameraModel.looking_at(self.position, self.look_at, self.focal, self.width, self.height)
 
 
 def _usual_indentation(given: dict[str, Any]) -> float:

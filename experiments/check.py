@@ -14,7 +14,7 @@ from control.motion import PEAK
 from drivers.config import ArmConfig, ForceTorqueConfig, TactileConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
-from experiments import disk
+from experiments import disk, in_view
 from experiments.calibrate.schema import CameraStage, FrictionStage
 from experiments.calibrate.store import Calibrations, load
 from experiments.faults.schema import FaultsStage
@@ -74,13 +74,15 @@ def check(
     if problems:
         raise InputError(problems)
     disk.require_store(resolved)
-    made = tasks(resolved, believed(resolved, calibrations), feasible)
+    known = believed(resolved, calibrations)
+    made = tasks(resolved, known, feasible)
     plans = plan_files(resolved, own)
     problems = [
         problem
         for eo in {*map(resting_eo, made.values()), *map(_resting_of_plan, plans.values())} - {None}
         for problem in _scene_problems(resolved, eo)
     ]
+    problems = problems or in_view.problems(resolved, known, made, plans)
     if problems:
         raise InputError(problems)
     experiment, station = resolved.experiment, resolved.station

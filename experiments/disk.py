@@ -6,12 +6,14 @@ import errno
 import os
 import shutil
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from drivers.errors import DeviceFault
 from experiments import registries
 from experiments.calibrate import store
 from experiments.calibrate.schema import CalibrationStage
 from experiments.files import Resolved
+from experiments.json_output import STDOUT
 from experiments.schema import ExecuteStage
 from experiments.setup import has_fingers
 from mechanics.yaml_input import InputError, Problem
@@ -49,6 +51,29 @@ def require_room(resolved: Resolved, folder: Path) -> None:
         wrong = f"{free / 1e6:.0f} MB are free there, and the run may need {needed / 1e6:.0f} MB"
         remedy = "a folder with more room, or fewer trials at a time"
         raise InputError([Problem(str(folder), None, "--out", wrong, remedy)])
+
+
+def require_writable(file: Path | None, option: str) -> None:
+    """Raises InputError where ``file``, which an ``option`` names, cannot be written; leaves nothing behind."""
+    if file is None or file == STDOUT:
+        return
+    there = file.absolute().parent
+    try:
+        if file.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        while not there.exists() and there != there.parent:
+            there = there.parent
+        with TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        wrong, expected = f"cannot be written: {error.strerror or error}", "a file in a place you may write to"
+        raise InputError([Problem(str(file), None, option, wrong, expected)]) from None
+
+
+def not_kept(error: OSError, folder: Path) -> DeviceFault:
+    """What a campaign or a table ends with whose summary cannot be written."""
+    remedy = f"All that was run is in {folder}. Make room there, then start again with --out {folder}"
+    return DeviceFault("disk", f"write {error.filename or folder}", error.strerror or str(error), remedy)
 
 
 def require_store(resolved: Resolved) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -58,7 +59,46 @@ def error_table(results: dict[str, Any]) -> Table:
         if printed is not None:
             name = controller if len(group) == 1 else ""
             table.add_row(name, "", "paper", *(_cell(printed.get(key)) for key in figures), style="dim")
+    for row in _differences(groups, figures, several):
+        table.add_section()
+        table.add_row(*row)
     return table
+
+
+def _differences(
+    groups: Mapping[tuple[str, str], Sequence[dict[str, Any]]], keys: Sequence[str], several: bool
+) -> Iterator[list[str]]:
+    """A line for each controller against its skill's first one, over two and more trials that both have: the mean
+    difference and its 95 % interval."""
+    first: dict[str, str] = {}
+    for (skill, controller), group in groups.items():
+        base = first.setdefault(skill, controller)
+        if controller == base or len(group) < 2:
+            continue
+        from experiments.statistics import paired_over  # scipy's statistics take a second to import
+
+        found = {key: paired_over(_by_trial(group, key), _by_trial(groups[skill, base], key)) for key in keys}
+        pairs = max((one.n for one in found.values() if one is not None), default=0)
+        if pairs > 1:
+            name = f"{controller} − {base}"
+            cells = [
+                "–" if one is None or one.low is None else f"{one.mean:+.2f}\n{one.low:+.2f}…{one.high:+.2f}"
+                for one in found.values()
+            ]
+            yield [f"{skill}, {name}" if several else name, f"{pairs} pairs", "measured\n95 %", *cells]
+
+
+def _by_trial(group: Sequence[dict[str, Any]], key: str) -> dict[Hashable, float]:
+    """A figure by the trial's number; and by how often it has come before, where a run has several plans of a skill."""
+    found: dict[Hashable, float] = {}
+    times: Counter[int] = Counter()
+    for trial in group:
+        number = trial.get("trial", 0)
+        figure = (trial["measured"] or {}).get(key)
+        if figure is not None:
+            found[number, times[number]] = figure["mean"]
+        times[number] += 1
+    return found
 
 
 def _rows(

@@ -9,9 +9,10 @@ from typing import Any
 
 import pandas as pd
 
+from experiments import disk
 from experiments.bench.figures import TARGETS, Target, Targets
 from experiments.exit_codes import ExitCode
-from experiments.json_output import beside, put
+from experiments.json_output import beside, write
 from experiments.paper import tables as paper_tables
 from experiments.provenance import provenance
 from experiments.run_folder import write_atomic, write_json
@@ -20,7 +21,7 @@ from experiments.table.jobs import Options
 from experiments.table.measure import CalibrationFailed, Engine, measure
 from experiments.table.schema import Table
 from experiments.terminal import terminal
-from mechanics.yaml_input import InputError, Problem, parse, read_yaml
+from mechanics.yaml_input import parse, read_yaml
 
 #: columns of a table that goes to a file or a pipe
 FILE_WIDTH = 100
@@ -34,7 +35,11 @@ def main(
     json_file: Path | None = None,
     check: bool = False,
 ) -> ExitCode:
-    """Make a table and show it. Raises InputError and InfeasiblePlan before anything is started."""
+    """Make a table and show it.
+
+    Raises InputError and InfeasiblePlan before anything is started, and DeviceFault where it cannot be kept.
+    """
+    disk.require_writable(json_file, "--json")
     table, sets = jobs.load_table(name, options.sets)
     options = Options(options.seed, options.trials, options.runs, sets)
     said = terminal(stderr=True)
@@ -45,16 +50,23 @@ def main(
         said.print(f"[red]{error}[/]", soft_wrap=True, highlight=False)
         return ExitCode.DEVICE_FAILED if error.status in ("failed", "device_failed") else ExitCode.FELL_SHORT
     result = {**stated(table, options, data), "calibrations": believed(folder)}
-    keep(folder, result, data)
-    put(json_file, result)
     console = beside(json_file, FILE_WIDTH)
     render.show(console, result)
+    try:
+        keep(folder, result, data, json_file)
+    except OSError as error:
+        raise disk.not_kept(error, folder) from None
     console.print(f"table: {folder / 'table.md'}", soft_wrap=True, highlight=False)
     for line in result["shortfalls"] if check else []:
         said.print(f"short: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
     if any(trial["status"] in ("failed", "device_failed") for trial in result["incomplete"]):
         return ExitCode.DEVICE_FAILED
-    return ExitCode.FELL_SHORT if check and result["shortfalls"] else ExitCode.DONE
+    fell_short = len(aggregate.fell_short(table, data.trials))
+    if result["incomplete"]:
+        told = f"{len(result['incomplete'])} of {len(data.trials)} trials were not completed"
+        told += f"; {fell_short} of them had to be" if fell_short else ", which no count of the table asks for"
+        said.print(told, style="red" if fell_short else None, highlight=False, soft_wrap=True)
+    return ExitCode.FELL_SHORT if fell_short or (check and result["shortfalls"]) else ExitCode.DONE
 
 
 def stated(table: Table, options: Options, data: aggregate.Data) -> dict[str, Any]:
@@ -103,19 +115,16 @@ def _judged(found: aggregate.Finding, target: Target | None) -> dict[str, Any]:
     }
 
 
-def keep(folder: Path, result: dict[str, Any], data: aggregate.Data) -> None:
-    """Write table.json, table.md, trials.parquet and plans.parquet. Raises InputError where it cannot."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "table.json", result)
-        write_atomic(folder / "table.md", render.markdown(result))
-        for name, frame in (("trials", data.trials), ("plans", data.plans)):
-            aside = folder / f".{name}.parquet"
-            _plain(frame).to_parquet(aside, index=False)
-            aside.replace(folder / f"{name}.parquet")
-    except OSError as error:
-        wrong = f"cannot be written: {error.strerror}"
-        raise InputError([Problem(str(error.filename), None, "", wrong, "a place you may write to")]) from None
+def keep(folder: Path, result: dict[str, Any], data: aggregate.Data, json_file: Path | None) -> None:
+    """Write table.json, table.md, trials.parquet and plans.parquet. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "table.json", result)
+    write_atomic(folder / "table.md", render.markdown(result))
+    for name, frame in (("trials", data.trials), ("plans", data.plans)):
+        aside = folder / f".{name}.parquet"
+        _plain(frame).to_parquet(aside, index=False)
+        aside.replace(folder / f"{name}.parquet")
+    write(json_file, result)
 
 
 def _plain(frame: pd.DataFrame) -> pd.DataFrame:

@@ -102,6 +102,11 @@ class TestRefused:
         assert "tcp://127.0.0.1:9" in said
         assert "dask scheduler" in said
 
+    def test_a_summary_that_could_not_be_written(self):
+        code, said = refused("--json", "/proc/nope/x.json")
+        assert code == 2
+        assert "/proc/nope/x.json: --json: cannot be written" in said
+
     def test_workers_beside_a_scheduler(self):
         assert refused("--scheduler", "tcp://127.0.0.1:9", "--workers", "3")[0] == 2
 
