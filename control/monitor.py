@@ -16,6 +16,8 @@ from planning.plan import Plan
 _AT_REST = np.zeros(3)
 #: the length that weighs a point's travel against a normal's turn where a contact's face is looked for [m]
 _ARM = 0.01
+#: the "waypoint" before the first: nothing has touched yet, and the objects are where the preload begins
+_BEFORE = -1
 
 
 @dataclass(frozen=True)
@@ -35,8 +37,9 @@ class Deviation:
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """The points of both bodies that touched at waypoint ``step``: ``corner`` and ``face`` (2,) in their frames, as
-    measured, and ``planned`` (2,), the face's as the plan has it. ``mode`` is the one planned there."""
+    """The points of both bodies that touched at waypoint ``step`` (−1: before touch-down): ``corner`` and ``face`` (2,)
+    in their frames, as measured, and ``planned`` (2,), the face's as the plan has it. ``mode`` is the one planned
+    there."""
 
     step: int
     mode: Mode
@@ -49,12 +52,13 @@ class _Mark:
 class ContactMonitor:
     """Watches at the waypoints whether each contact of ``plan`` behaves in its planned mode.
 
-    At the first waypoint at which a contact is seen, the points of both bodies that touch there are marked. From then
-    on they stay together where the contact sticks, part along the face as planned where it slips, and never leave each
-    other along the normal: more than ``tolerance`` [m] is a deviation. So a contact that lands elsewhere, because the
-    go lies otherwise in the fingers, has not slipped: it has to stick where it landed. What is not seen is judged by
-    the wrench alone: ``load`` is the fraction of the planned force on the go below which its contact counts as lost,
-    ``force_limit`` [N] what ends a trial.
+    The points of both bodies that touch are marked: where the extrinsic object sticks to the ground before touch-down
+    (`before_touch`), else at the first waypoint at which the contact is seen. From then on they stay together where the
+    contact sticks, part along the face as planned where it slips, and never leave each other along the normal: more
+    than ``tolerance`` [m] is a deviation. So a contact that lands elsewhere, because the go lies otherwise in the
+    fingers, has not slipped: it has to stick where it landed. What is not seen is judged by the wrench alone: ``load``
+    is the fraction of the planned force on the go below which its contact counts as lost, ``force_limit`` [N] what ends
+    a trial.
     """
 
     plan: Plan
@@ -68,15 +72,27 @@ class ContactMonitor:
     def __post_init__(self) -> None:
         self._pairs = [corner_and_face(self.plan, c) for c in range(len(self.plan.contact_names))]
 
+    def before_touch(self, X_W_eo: Array) -> None:
+        """Mark where the extrinsic object stands on the ground, seen at ``X_W_eo`` (3,) before anything touched it.
+
+        Where it is to stick, it has to stick from there on: it may slide in the preload as well as later.
+        """
+        state = PlanarState(self.plan.preload_ee[0], None, X_W_eo, np.zeros(3))
+        for c, mode in enumerate(self.plan.contact_modes[0]):
+            if mode is Mode.STICK:
+                self._marked(c, _BEFORE, state)
+
     def check(self, step: int, measured: PlanarState, weight: Array) -> Deviation | None:
         """The deviation at waypoint ``step``, or None. ``weight`` (2,) [N] is the force of gravity on the go in W."""
-        numbers = [value for value in (measured.ee, measured.go, measured.eo, measured.wrench) if value is not None]
-        if not np.isfinite(np.concatenate(numbers)).all():
+        if not measured.is_finite:
             return Deviation("diverged", f"waypoint {step}: a measurement is not finite", step)
         force = float(np.hypot(*measured.wrench[:2]))
         if force > self.force_limit:
             reason = f"waypoint {step}: {force:.1f} N exceeds the limit of {self.force_limit:g} N"
             return Deviation("stopped", reason, step)
+        moved = self._moved(step, measured)
+        if moved is not None and moved.status == "slipped":  # what has slid away may bear on nothing any more
+            return moved
         # the environment's force on the go is what balance leaves: -(sensor + weight)
         environment = -(measured.wrench[:2] + weight)
         planned = -(self.plan.wrench[step, :2] + weight)
@@ -85,7 +101,12 @@ class ContactMonitor:
             along = float(environment @ planned) / size
             reason = f"waypoint {step}: {along:.2f} N along the planned contact force of {size:.2f} N"
             return Deviation("lost_contact", reason, step)
-        return self._moved(step, measured)
+        return moved
+
+    def has_slipped(self, step: int, seen: PlanarState) -> bool:
+        """Whether a contact that is marked has slipped from there otherwise than planned; nothing is marked by it."""
+        found = self._moved(step, seen, make=False) if seen.is_finite else None
+        return found is not None and found.status == "slipped"
 
     def restart(self, step: int, measured: PlanarState) -> None:
         """Mark the contacts anew as they are at waypoint ``step``: what has happened so far is taken in."""
@@ -94,42 +115,43 @@ class ContactMonitor:
         for c in range(len(self.plan.contact_names)):
             self._marked(c, step, measured)
 
-    def _moved(self, step: int, measured: PlanarState) -> Deviation | None:
-        """What has opened, or else what has not slipped as planned. A slip that opens a contact is a lost contact."""
-        slipped = None
+    def _moved(self, step: int, measured: PlanarState, *, make: bool = True) -> Deviation | None:
+        """What has not slipped as planned, or else what has opened. A slip that opens its own contact is a lost one."""
+        opened = None
         for c, name in enumerate(self.plan.contact_names):
-            mark = self._marked(c, step, measured)
+            mark = self._marked(c, step, measured, make=make)
             if mark is None:
                 continue
             slip, gap = self._since(mark.face, mark, c, step, measured)
-            where = f"waypoint {step}: contact '{name}'"
-            if gap > self.tolerance:
-                reason = f"{where} has opened by {gap * 1e3:.1f} mm since waypoint {mark.step}"
-                return Deviation("lost_contact", reason, step, name, slip)
+            where, since = f"waypoint {step}: contact '{name}'", _since_when(mark.step)
             wrong = self._not_as_planned(mark, c, step, slip)
-            if wrong and slipped is None:
-                slipped = Deviation("slipped", f"{where} {wrong} since waypoint {mark.step}", step, name, slip)
-        return slipped
+            if gap > self.tolerance:
+                reason = f"{where} has opened by {gap * 1e3:.1f} mm {since}"
+                opened = opened or Deviation("lost_contact", reason, step, name, slip)
+            elif wrong:
+                return Deviation("slipped", f"{where} {wrong} {since}", step, name, slip)
+        return opened
 
-    def _marked(self, c: int, step: int, measured: PlanarState) -> _Mark | None:
-        """The marks of a contact, made now where there are none of its present mode; None where it is not seen."""
-        mode, mark = self.plan.contact_modes[step][c], self._marks.get(c)
+    def _marked(self, c: int, step: int, measured: PlanarState, *, make: bool = True) -> _Mark | None:
+        """The marks of a contact, made now where there are none of its present mode, unless ``make`` forbids it; None
+        where there are none, or it is not seen."""
+        mode, mark = self.plan.contact_modes[max(step, 0)][c], self._marks.get(c)
         if mark is not None and mark.mode is not mode:
             del self._marks[c]
             self._best.pop(c, None)
-            mark = None
         corner, face = self._pairs[c]
         X_corner, X_face = _pose(measured, corner), _pose(measured, face)
         if mode is Mode.FREE or X_corner is None or X_face is None:
             return None
-        if mark is None:
-            point = self.plan.contact_points[step, c]
-            planned = _planned(self.plan, step)
-            of_corner = se2.transform(se2.inverse(_known(planned, corner)), point)
+        if make and c not in self._marks:
+            told, planned = max(step, 0), _planned(self.plan, step)  # a plan tells contacts from its first waypoint on
+            X_told = _known(_planned(self.plan, told), corner)
+            of_corner = se2.transform(se2.inverse(X_told), self.plan.contact_points[told, c])
             touched = se2.transform(se2.inverse(X_face), se2.transform(X_corner, of_corner))
-            of_face = se2.transform(se2.inverse(_known(planned, face)), point)
-            mark = self._marks[c] = _Mark(step, mode, of_corner, touched, of_face)
-        return mark
+            meant = se2.transform(_known(planned, corner), of_corner)
+            of_face = se2.transform(se2.inverse(_known(planned, face)), meant)
+            self._marks[c] = _Mark(step, mode, of_corner, touched, of_face)
+        return self._marks.get(c)
 
     def _since(self, face: Array, mark: _Mark, c: int, step: int, state: PlanarState) -> tuple[float, float]:
         """(slip, gap) [m] in a state since the mark was made, whose point on the face is at ``face`` (2,)."""
@@ -204,6 +226,10 @@ def _track(plan: Plan, body: str) -> Array:
 
 
 def _planned(plan: Plan, step: int) -> PlanarState:
+    """Where the plan has everything at a waypoint, or as the preload begins."""
+    if step == _BEFORE:
+        eo = None if plan.preload_eo is None else plan.preload_eo[0]
+        return PlanarState(plan.preload_ee[0], plan.preload_go[0], eo, plan.preload_wrench[0])
     return PlanarState(plan.ee[step], plan.go[step], None if plan.eo is None else plan.eo[step], plan.wrench[step])
 
 
@@ -216,6 +242,10 @@ def _known(state: PlanarState, body: str) -> Array:
     pose = _pose(state, body)
     assert pose is not None  # asked for only where it was seen
     return pose
+
+
+def _since_when(step: int) -> str:
+    return "since touch-down" if step == _BEFORE else f"since waypoint {step}"
 
 
 def _told(slip: float) -> str:

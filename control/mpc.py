@@ -79,14 +79,14 @@ class Mpc(Controller):
 
     def in_air(self, go_desired: Array, measured: PlanarState) -> None:
         """Learn how the go lies in the fingers, where nothing else bears on it."""
-        if not _finite(measured):
+        if not measured.is_finite:
             return
         self._belief.in_air(self._in_table(measured))
         self._correct()
 
     def in_contact(self, step: int, measured: PlanarState) -> None:
         """Take in what is seen at waypoint ``step``, and plan anew from there. What is no number is not seen."""
-        if not _finite(measured):
+        if not measured.is_finite:
             return
         self._touched = True
         self._belief.in_contact(step, self._in_table(measured), self._predicted(step))
@@ -178,9 +178,3 @@ class Mpc(Controller):
         theta = go[2] - self._problem.angle[0] if corner else go[2]
         off = (1.0 if corner else -1.0) * se2.rotate(theta, seen.travel * e)
         return np.append(off + se2.rotate(self._table[2], np.array([seen.along, 0.0])), 0.0)
-
-
-def _finite(measured: PlanarState) -> bool:
-    """Whether all that was measured is numbers."""
-    seen = [value for value in (measured.ee, measured.go, measured.eo, measured.wrench) if value is not None]
-    return bool(np.isfinite(np.concatenate(seen)).all())

@@ -13,6 +13,7 @@ from control.reads import Read, Reads
 from control.witness import TableWitness
 from drivers.errors import DeviceFault, DeviceTimeout
 from drivers.interfaces import Arm, ForceTorqueSensor, TactileSensor, TagCamera
+from estimation.finger_slip import Drift, FingerSlip
 from estimation.force_torque import FreeAirLoad, WristSensor, mean_wrench
 from estimation.state import State, StateEstimator
 from estimation.tactile_pose import PoseStatus, TactilePoseEstimator, fuse
@@ -64,10 +65,20 @@ class Observer:
     note: Callable[[str, dict[str, Any], list[Read]], None] | None = None
     #: the state behind the newest `estimate` from the fingers
     felt: State | None = None
+    #: how the object lies in the fingers otherwise than in free air, by the newest look at both; None: nobody knows
+    drift: Drift | None = None
     _heard_ns: int = -1
     _zero: Zero | None = None
     _seen: dict[str, tuple[int, TagPose]] = field(default_factory=dict)
     _looking: bool = False
+    _told: PlanarState | None = None
+    _known: State | None = None
+
+    def __post_init__(self) -> None:
+        # one that goes by the go's tag, and one by what the fingers feel
+        self._by_tag, self._by_touch = (
+            None if self.state is None else FingerSlip(self.grasp, self.state.elasticity) for _ in range(2)
+        )
 
     @contextmanager
     def _look(self, act: str, told: dict[str, Any] | None = None) -> Iterator[dict[str, Any]]:
@@ -137,7 +148,10 @@ class Observer:
         go = None if seen["go"] is None else seen["go"].pose
         eo = None if seen["eo"] is None else seen["eo"].pose
         grasp_centre = se2.compose(ee if go is None else go, np.zeros(3) if go is None else self.grasp)
-        return PlanarState(ee, go, eo, self.wrist_sensor.wrench_on_go(reading, ee, grasp_centre[:2]))
+        found = PlanarState(ee, go, eo, self.wrist_sensor.wrench_on_go(reading, ee, grasp_centre[:2]))
+        drift = None if self._by_tag is None else self._by_tag.drift(found)
+        self.drift = self.drift if drift is None and self.fingers else drift  # they were felt right before
+        return found
 
     def estimate(self) -> PlanarState:
         """What controllers act on, at this instant: from the fingers and the elasticity where there are fingers.
@@ -164,8 +178,9 @@ class Observer:
                 "See to the fingers and the grasp, or take the pose from tags: --set trial.go_pose=tags",
             )
         self.felt = now
-        on_go = wrench.about(now.wrench, now.centre, se2.compose(now.go, self.grasp)[:2])
-        return PlanarState(now.ee, now.go, None if extrinsic is None else extrinsic.pose, on_go)
+        self._told = self._planar(now, None if extrinsic is None else extrinsic.pose)
+        self.drift = None if self._by_touch is None else self._by_touch.drift(self._told, now.go_covariance)
+        return self._told
 
     def _feel(self, state: StateEstimator) -> None:
         """Take in one picture of each finger, and what arm and wrist have said until then."""
@@ -193,6 +208,11 @@ class Observer:
         if seen is not None:
             state.push_tag(body, *seen)
 
+    def _planar(self, now: State, eo: Array | None) -> PlanarState:
+        """A whole state as plans and `measure` have it: the wrench about the planned grasp centre on the go."""
+        on_go = wrench.about(now.wrench, now.centre, se2.compose(now.go, self.grasp)[:2])
+        return PlanarState(now.ee, now.go, eo, on_go)
+
     def state_now(self) -> State | None:
         """The whole state at a settled instant, after `measure`; None without a ``state`` estimator.
 
@@ -208,7 +228,7 @@ class Observer:
     def contact(self) -> ContactBelief | None:
         """Where the go is believed to be touched, of `state_now`; None where nobody looks for it."""
         with self._look("contact") as told:
-            now = self.state_now()
+            self._known = now = self.state_now()
             if now is not None:
                 told["state"] = now.told()
         if now is None or now.contact is None:
@@ -216,6 +236,16 @@ class Observer:
         found = now.contact.hypotheses
         points = np.array([one.point for one in found]).reshape(-1, 2)
         return ContactBelief(now.contact.status.value, points, np.array([one.weight for one in found]))
+
+    @property
+    def estimated(self) -> PlanarState | None:
+        """The state behind the newest `contact`, which takes no look of its own; None without a ``state`` estimator.
+
+        From the fingers where there are some, as `estimate` told it, else from arm, wrist, tags and elasticity.
+        """
+        if self.fingers or self._known is None:
+            return self._told
+        return self._planar(self._known, self._known.eo)
 
     def second_opinion(self, measured: PlanarState) -> Agreement | None:
         """What the sensor under the table says of the wrench in ``measured``; None where it says nothing."""
@@ -234,8 +264,11 @@ class Observer:
         """What is known of the object slipping in the fingers in this grasp; empty where it has not."""
         return self.felt.reason if self.felt is not None and self.felt.status is PoseStatus.SLIPPED else ""
 
-    def zero(self, load: FreeAirLoad, X_W_go: Array) -> None:
-        """Take the offsets in free air: the wrist's, under the weight of a go at ``X_W_go`` alone, and the table's."""
+    def zero(self, load: FreeAirLoad, X_W_go: Array, *, seen: bool = True) -> None:
+        """Take the offsets in free air: the wrist's, under the weight of a go at ``X_W_go`` alone, and the table's.
+
+        How the go lies in the fingers from then on is held against how it does here; its tag tells only if ``seen``.
+        """
         with self._look("zero", {"X_W_go": np.asarray(X_W_go, float).tolist()}):
             ee = self.arm_pose()
             self.wrist_sensor = self.wrist_sensor.zeroed(self.mean_reading(), ee, X_W_go, self.grasp, load)
@@ -245,6 +278,11 @@ class Observer:
             self.state.wrist, self.state.zero = self.wrist_sensor, self._zero
         if self.witness is not None:
             self.witness.zero(now)
+        weight = load.wrench_on_go(X_W_go, se2.compose(X_W_go, self.grasp)[:2])
+        if self._by_tag is not None:
+            self._by_tag.hangs(PlanarState(ee, X_W_go if seen else None, None, weight))
+        if self._by_touch is not None and self.felt is not None and self._told is not None:
+            self._by_touch.hangs(self._told, self.felt.go_covariance)
 
 
 def _distrust(device: str, asked: str, status: Status) -> NoReturn:

@@ -51,14 +51,17 @@ class Gains:
 
 
 class _Place:
-    """Where something that sticks was seen, on average [m], and whether it was found elsewhere, ``slid``, just now."""
+    """Where something that sticks was seen, on average [m], and whether it was found elsewhere, ``slid``, just now.
+
+    Before the first look it stands where the plan has it, at 0.
+    """
 
     def __init__(self) -> None:
         self.value, self._count, self.slid = 0.0, 0, False
 
     def see(self, seen: float, slip: float) -> None:
         """Take in where it is seen (NaN: it is not); farther than ``slip`` from where it stood it has slid there."""
-        self.slid = bool(self._count) and abs(seen - self.value) > slip
+        self.slid = abs(seen - self.value) > slip
         if self.slid:
             self.put(seen)
         elif not np.isnan(seen):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from control.observe import Observer
 from control.settings import TrialSettings
 from drivers.errors import CommandRefused, DriverError, SimulationDiverged
 from drivers.interfaces import Clock
+from estimation.finger_slip import Drift
 from estimation.force_torque import FreeAirLoad
 from estimation.tag_pose import TagPose
 from estimation.tool_identification import Agreement
@@ -33,7 +34,9 @@ class TrialResult:
     """How a trial ended (statuses of design §6) and what it recorded. ``plan`` is the plan as anchored.
 
     ``device`` is the one that failed. ``witness`` is what the sensor under the table said of the wrist's force, at the
-    waypoints where it said anything. ``deviation`` is the first that the law did not take in.
+    waypoints where it said anything. ``drifts`` tell how the object lay in the fingers at the waypoints, by number,
+    where that was seen, and ``finger_slip`` what was said of it when it had slipped there. ``deviation`` is the first
+    that the law did not take in.
     """
 
     status: str
@@ -41,6 +44,8 @@ class TrialResult:
     plan: Plan
     waypoints: list[WaypointRecord] = field(default_factory=list)
     witness: list[Agreement] = field(default_factory=list)
+    drifts: dict[int, Drift] = field(default_factory=dict)
+    finger_slip: str = ""
     deviation: Deviation | None = None
     device: str = ""
 
@@ -52,8 +57,8 @@ class Watch:
     waypoint: Callable[[WaypointRecord], None] = lambda _waypoint: None
     phase: Callable[[str, float], None] = lambda _name, _fraction: None
     event: Callable[[str, str], None] = lambda _level, _text: None
-    #: what the fingers tell, each time they are asked
-    estimate: Callable[[PlanarState], None] = lambda _state: None
+    #: the wrench (3,) on the grasped object that its place in the fingers tells, axes of W, each time it is seen
+    felt: Callable[[Array], None] = lambda _wrench: None
     #: once per set-point; whatever it raises ends the trial
     tick: Callable[[], None] = lambda: None
     #: asks a person to reset the scene and says whether they did; a station without a person answers False
@@ -84,7 +89,7 @@ class Trial:
         self._observer, self._clock, self._load = observer, clock, load
         self._settings, self._watch = settings, watch
         self._result = TrialResult("completed", "", plan)
-        self._slip_told = self._witness_told = False
+        self._witness_told = False
         self._mover = Mover.of(observer.arm, clock, observer.arm_pose(), settings, watch.tick)
 
     def run(self) -> TrialResult:
@@ -120,10 +125,12 @@ class Trial:
         go_air = self._lifted(self._nominal)
         mover.go_above(self._nominal.free_air_ee(go_air))
         self._settle()
-        plan = self._anchored(go_air)
+        plan, X_W_eo = self._anchored(go_air)
         self._result.plan = plan
         controller = self._make_controller(plan)
         monitor = ContactMonitor(plan, s.slip_tolerance_mm * 1e-3, s.force_limit)
+        if X_W_eo is not None:
+            monitor.before_touch(X_W_eo)
 
         go_air = self._lifted(plan)
         ee_air = plan.free_air_ee(go_air)
@@ -144,16 +151,24 @@ class Trial:
         steps = len(plan.ee)
         for k in range(steps):
             self._watch.phase("trajectory", k / steps)
-            measured, commanded, estimated, contact = self._visit(controller, plan, k)
+            measured, told, commanded, contact = self._visit(controller, plan, monitor, k)
             planned = PlanarState(plan.ee[k], plan.go[k], None if plan.eo is None else plan.eo[k], plan.wrench[k])
             record = WaypointRecord(
-                self._clock.now_ns(), self._name, k, planned, commanded, measured, None, estimated, contact
+                self._clock.now_ns(),
+                self._name,
+                k,
+                planned,
+                commanded,
+                measured,
+                None,
+                self._observer.estimated,
+                contact,
             )
             self._result.waypoints.append(record)
             self._watch.waypoint(record)
             deviation = monitor.check(k, measured, weight)
             if deviation is not None:
-                if self._taken_in(deviation, controller, measured if estimated is None else estimated):
+                if self._taken_in(deviation, controller, told):
                     monitor.restart(k, measured)
                 else:
                     self._deviates(deviation)
@@ -165,9 +180,13 @@ class Trial:
         self._watch.phase("done", 1.0)
 
     def _visit(
-        self, controller: Controller, plan: Plan, k: int
-    ) -> tuple[PlanarState, Array, PlanarState | None, ContactBelief | None]:
+        self, controller: Controller, plan: Plan, monitor: ContactMonitor, k: int
+    ) -> tuple[PlanarState, PlanarState, Array, ContactBelief | None]:
         """Go to waypoint ``k``, let the controller correct it, and measure once settled.
+
+        What is measured, what a law is told there, the pose commanded, and where the go is believed to be touched.
+
+        What has slipped is not corrected before the law was asked about it: it would be followed wherever it has gone.
 
         What slips is moved on, never about: there an update acts in the motion to the next waypoint. A small motion
         back would leave the contact stuck with less friction than it slips with, and several times as stiff.
@@ -178,17 +197,25 @@ class Trial:
         updates = s.corrections if controller.feedback else 0
         later = slips(plan)
         for _ in range(0 if later else updates):
-            controller.in_contact(k, self._estimate())
-            self._tell_slip()
+            told = self._estimate()
+            # the monitor goes by tags: a go that is felt lies elsewhere by what fingers and tags disagree in
+            if self._slid(monitor, k, replace(told, go=None) if self._observer.fingers else told):
+                break
+            controller.in_contact(k, told)
             mover.ramp(controller.waypoint(k), s.ramp)
             self._settle()
         estimated = self._estimate() if self._observer.fingers else None
         measured = self._observer.measure()
-        if later and updates:
-            controller.in_contact(k, measured if estimated is None else estimated)
-            self._tell_slip()
-        self._hear_witness(k, measured)
-        return measured, mover.pose, estimated, self._observer.contact()
+        told = measured if estimated is None else estimated
+        if later and updates and not self._slid(monitor, k, measured):
+            controller.in_contact(k, told)
+        agreed = self._hear_witness(k, measured)
+        self._hear_grasp(k, agreed)
+        return measured, told, mover.pose, self._observer.contact()
+
+    def _slid(self, monitor: ContactMonitor, k: int, seen: PlanarState) -> bool:
+        """Whether a contact is ``seen`` to have slipped, and nobody has decided about it yet."""
+        return self._result.deviation is None and monitor.has_slipped(k, seen)
 
     def _taken_in(self, found: Deviation, controller: Controller, told: PlanarState) -> bool:
         """Whether the law, asked with what it is ``told`` of this instant, goes on. After a refusal nobody asks."""
@@ -210,10 +237,11 @@ class Trial:
             result.status, result.reason = found.status, found.reason
             self._watch.event("warning", f"{found.reason}; the trial goes on")
 
-    def _hear_witness(self, k: int, measured: PlanarState) -> None:
+    def _hear_witness(self, k: int, measured: PlanarState) -> bool:
+        """Whether the sensor under the table has nothing against the wrist's force. The first that it has is told."""
         found = self._observer.second_opinion(measured)
         if found is None:
-            return
+            return True
         self._result.witness.append(found)
         if not found.agrees and not self._witness_told:
             self._witness_told = True
@@ -223,16 +251,32 @@ class Trial:
                 f"waypoint {k}: the wrist's force and the one under the table differ by ({dx:+.2f}, {dy:+.2f}) N, more "
                 f"than their errors allow: check both sensors, and what touches the table besides the objects",
             )
+        return found.agrees
 
     def _estimate(self) -> PlanarState:
         state = self._observer.estimate()
-        self._watch.estimate(state)
+        self._tell_felt()
         return state
 
-    def _tell_slip(self) -> None:
-        if self._observer.slip and not self._slip_told:
-            self._slip_told = True
-            self._watch.event("warning", self._observer.slip)
+    def _tell_felt(self) -> None:
+        if self._observer.drift is not None:
+            self._watch.felt(self._observer.drift.wrench)
+
+    def _hear_grasp(self, k: int, trusted: bool) -> None:
+        """Keep how the object lies in the fingers at a settled waypoint; the first slip there is told.
+
+        Without a wrist that is ``trusted`` a slip is not told from a force that nobody has measured.
+        """
+        self._tell_felt()
+        drift, result, said = self._observer.drift, self._result, self._observer.slip
+        if drift is not None:
+            result.drifts[k] = drift
+            if drift.slipped and trusted:
+                said = f"the object has slipped in the fingers by {drift.size_mm:.1f} mm and {drift.size_deg:.1f} deg"
+        if said and not result.finger_slip:
+            result.finger_slip = f"waypoint {k}: {said}"
+            advice = "grip it harder, or press less; where it has not moved, check the wrist's sensor"
+            self._watch.event("warning", f"{result.finger_slip}: {advice}")
 
     def _converge_in_air(self, controller: Controller, go: Array, ee: Array) -> None:
         for _ in range(self._settings.air_corrections):
@@ -243,10 +287,10 @@ class Trial:
             if np.hypot(*(controller.correction - before)[:2]) < 2e-5:
                 break
 
-    def _anchored(self, go_expected: Array) -> Plan:
+    def _anchored(self, go_expected: Array) -> tuple[Plan, Array | None]:
         """Verify the start by tags, zero the wrist sensor under the go's weight, and anchor the plan.
 
-        It is anchored to the table and, along it, to the extrinsic object.
+        It is anchored to the table and, along it, to the extrinsic object, whose pose in W (3,) is told with it.
         """
         bodies = ("table", "go") if self._nominal.eo is None else ("table", "go", "eo")
         if not self._observer.tags.get("go"):
@@ -264,14 +308,15 @@ class Trial:
         table, go, eo = (seen.get(body) for body in ("table", "go", "eo"))
         assert table is not None  # _start_problem saw it
         self._zero(go, go_expected)
-        return anchored(self._nominal, table.pose, None if eo is None else eo.pose)
+        X_W_eo = None if eo is None else eo.pose
+        return anchored(self._nominal, table.pose, X_W_eo), X_W_eo
 
     def _zero(self, seen: TagPose | None, go_expected: Array) -> None:
         """Zero the force sensors in free air, under the weight of a go where its tag was seen, else where it should be.
 
         Once for what is estimated in air, and again just before touch-down: a sensor's zero walks meanwhile.
         """
-        self._observer.zero(self._load, go_expected if seen is None else seen.pose)
+        self._observer.zero(self._load, go_expected if seen is None else seen.pose, seen=seen is not None)
 
     def _start_problem(self, seen: dict, go_expected: Array) -> str | None:
         for body, pose in seen.items():

@@ -6,12 +6,13 @@ radius of gyration ρ: the own object's for poses, the go's for wrenches (design
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from shapely import MultiPoint, Point
 
+from estimation.finger_slip import Drift
 from estimation.tool_identification import Agreement
 from mechanics import se2
 from mechanics.friction import Mode
@@ -128,6 +129,19 @@ def witness_of(found: Sequence[Agreement]) -> dict[str, Any] | None:
     apart = [float(np.hypot(*one.difference)) for one in found]
     disagreements = sum(not one.agrees for one in found)
     return {"mean_N": float(np.mean(apart)), "max_N": max(apart), "disagreements": disagreements}
+
+
+def finger_slip_of(drifts: Mapping[int, Drift], said: str) -> dict[str, Any] | None:
+    """How far the object came to lie elsewhere in the fingers than in free air, beyond what their elasticity says.
+
+    ``mm`` and ``deg`` are the most of all waypoints, ``sigmas`` by what they could be without a slip; ``detected``
+    whether it has slipped, and ``reason`` what was ``said`` of it. None where nobody saw where it lies.
+    """
+    if not drifts and not said:
+        return None
+    sizes = {name: [getattr(one, name) for one in drifts.values()] for name in ("size_mm", "size_deg", "sigmas")}
+    most = {name.removeprefix("size_"): max(values, default=None) for name, values in sizes.items()}
+    return {**most, "detected": bool(said), "reason": said}
 
 
 def paper_summary(figures: dict[str, Figure], rho: float) -> dict[str, float]:

@@ -250,6 +250,7 @@ def _row(trial: LoggedTrial, plan: Plan, resolved: Resolved) -> dict[str, Any]:
         **errors,
         "contact": contact_of(trial.waypoints, plan, grasped.polygon),
         "witness": None,
+        "finger_slip": None,
         "rebuilt": True,
     }
 

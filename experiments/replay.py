@@ -231,6 +231,7 @@ class _Estimator:
             self._estimated = observer.estimate()
         elif act == "contact":
             self._contact = observer.contact()
+            self._estimated = observer.estimated
 
 
 # -- what differs ------------------------------------------------------------------------------------------------------
@@ -300,7 +301,10 @@ def _table(trial: str, found: Sequence[Again]) -> Table:
     table.add_column("apart")
     for again in found:
         was = again.recorded
-        for what, then, now in (("measured", was.measured, again.measured), ("felt", was.estimated, again.estimated)):
+        for what, then, now in (
+            ("measured", was.measured, again.measured),
+            ("estimated", was.estimated, again.estimated),
+        ):
             if then is not None or now is not None:
                 apart = [f"{value:.3g} {unit}" for unit, value in _apart(then, now).items()]
                 table.add_row(str(was.step), what, *_both(then, now, _object, _wrench), again.reason or _or_same(apart))

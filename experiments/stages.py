@@ -21,7 +21,7 @@ from experiments import kernels, looks, registries, setup
 from experiments.arrange import arrange, let_go
 from experiments.context import RunContext
 from experiments.faults.inject import Injector
-from experiments.metrics import contact_of, errors_of, witness_of
+from experiments.metrics import contact_of, errors_of, finger_slip_of, witness_of
 from experiments.planning.stage import plan_stage, take_plan_files
 from experiments.rehearse import rehearse
 from experiments.schema import ExecuteStage, Stage
@@ -145,7 +145,7 @@ def _one_trial(
             tick=context.heed,
             phase=on_phase,
             event=tell,
-            estimate=lambda state: devices.tell_wrench(state.wrench),
+            felt=devices.tell_wrench,
             reset_scene=context.ask if devices.simulation is None else lambda _what: False,
         )
         clock, load = devices.clock, setup.free_air_load(context.resolved)
@@ -207,6 +207,7 @@ def _row(
         **{witness: errors_of(waypoints, witness, rho_go, rho_eo, rho_go) for witness in ("measured", "truth")},
         "contact": contact_of(waypoints, result.plan, grasped.polygon),
         "witness": witness_of(result.witness),
+        "finger_slip": finger_slip_of(result.drifts, result.finger_slip),
     }
 
 

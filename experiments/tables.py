@@ -38,6 +38,9 @@ def error_table(results: dict[str, Any]) -> Table:
         groups.setdefault((trial["skill"], trial["controller"]), []).append(trial)
         style = None if trial["status"] == "completed" else "yellow"
         _rows(table, escape(trial["name"]), trial["status"], [trial], style, figures)
+        slip = trial.get("finger_slip")
+        if isinstance(slip, dict) and slip.get("detected") is True:
+            table.add_row("  slipped in the fingers", style="yellow")
     for rehearsal in results.get("rehearsals", ()):
         force = f"at most {rehearsal['force']:.2f} N on the object"
         table.add_row(escape(rehearsal["name"]), rehearsal["status"], "wrist", force)

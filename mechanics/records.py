@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from mechanics.readings import Array
 
 
@@ -18,6 +20,12 @@ class PlanarState:
     go: Array | None
     eo: Array | None
     wrench: Array
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all that is there is numbers."""
+        there = [value for value in (self.ee, self.go, self.eo, self.wrench) if value is not None]
+        return bool(np.isfinite(np.concatenate(there)).all())
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +50,10 @@ class ContactBelief:
 class WaypointRecord:
     """One settled waypoint of a trial: planned (anchored to the table), commanded ee pose, measured, and true.
 
-    ``estimated`` is what the controller was told of this instant, where it asks for more than what is measured (from
-    the tactile images, say), ``contact`` where the go was believed to be touched. ``truth`` is the plant's own state,
-    filled in by the runner in simulation only.
+    ``estimated`` is the whole state as estimated at this instant: from the fingers, as the controller was told, where
+    it feels; else from arm, wrist, tags and elasticity, and a controller was told what is ``measured``. ``contact`` is
+    where the go was believed to be touched. ``truth`` is the plant's own state, filled in by the runner in simulation
+    only.
     """
 
     capture_ns: int

@@ -54,6 +54,8 @@ def verdict(results: Mapping[str, Any], calibrations: int | None = None) -> Verd
         count = (
             f"{calibrations or 'no'} calibration{'s' * (calibrations > 1)} {'were' if calibrations > 1 else 'was'} made"
         )
+    if slid := sum(bool(finger_slip(trial)) for trial in trials):
+        count += f", in {slid} of them the object slipped in the fingers"
     reason = str(results.get("reason") or "").strip().rstrip(".")
     tail = f": {reason}." if reason else "."
     failed = next((trial for trial in trials if trial.get("status") in ABORTING), None)
@@ -68,6 +70,12 @@ def verdict(results: Mapping[str, Any], calibrations: int | None = None) -> Verd
     if done < len(trials) or status in SHORT:
         return Verdict("short", "Fell short", count + tail)
     return Verdict("completed", "Completed", count + tail)
+
+
+def finger_slip(trial: Mapping[str, Any]) -> str:
+    """What a trial's row says of the object having slipped in the fingers; empty where it has not."""
+    found = mapping(trial.get("finger_slip"))
+    return str(found.get("reason") or "the object slipped in the fingers") if found.get("detected") is True else ""
 
 
 def level(status: Any) -> str:
@@ -127,7 +135,7 @@ def error_table(results: Mapping[str, Any], paper: Any = None) -> dict[str, Any]
             "controller": words(trial.get("controller")),
             "status": words(status),
             "level": level(status),
-            "reason": str(trial.get("reason") or ""),
+            "reason": "; ".join(filter(None, (str(trial.get("reason") or ""), finger_slip(trial)))),
             "aggregates": {h[0]: {s: _figure(figure[s], h[0], h[3]) for s in sources} for h in heads},
             "components": {s: {c[0]: _figure(figure[s], c[0], c[3]) for c in COMPONENTS} for s in sources},
         }

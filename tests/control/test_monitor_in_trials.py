@@ -9,6 +9,7 @@ import pytest
 
 from control.closed_loop import ClosedLoop
 from control.open_loop import OpenLoop
+from estimation.tag_pose import TagPose
 from experiments import setup
 from mechanics.friction import Mode
 
@@ -128,6 +129,55 @@ def test_a_law_is_not_asked_about_a_stop():
     station, kept = Station(), {}
     assert station.run(made(Replanning, kept), force_limit=2.0).status == "stopped"
     assert kept["law"].asked == []
+
+
+def test_a_law_is_asked_about_a_slip_before_it_corrects_where_that_went():
+    calls = []
+
+    class Asked(ClosedLoop):
+        def in_contact(self, step, measured):
+            calls.append((step, "corrects"))
+
+        def replan(self, step, measured, deviation):
+            calls.append((step, "is asked"))
+            return True
+
+    result = Slippery("stages.0.parameters.steps=5").run(Asked, slip_tolerance_mm=0.1)
+    assert result.status == "completed"
+    asked = {step for step, what in calls if what == "is asked"}
+    assert len(asked) >= 2
+    assert calls == [(step, "is asked" if step in asked else "corrects") for step in range(5)]
+
+
+def test_an_object_that_slides_while_it_is_loaded_ends_the_trial_at_the_first_waypoint():
+    station = Station()
+    resting = np.array([0.1, 0.03, 0.0])
+    plan = replace(
+        station.plan,
+        eo=np.tile(resting, (STEPS, 1)),
+        preload_eo=np.tile(resting, (len(station.plan.preload_go), 1)),
+        unload_eo=np.tile(resting, (len(station.plan.unload_go), 1)),
+        contact_bodies=(("eo", "ground"),),
+        contact_points=np.tile([0.1, 0.0], (STEPS, 1, 1)),
+    )
+    station.plan = plan
+    observer = station.observer()
+    look, slid = observer._see, np.array([0.0, 0.0, 0.0])
+
+    def see(bodies):
+        found = look(tuple(body for body in bodies if body != "eo"))
+        if "eo" in bodies:
+            found["eo"] = TagPose(resting + slid, np.eye(3) * 1e-10, 0.1, 1)
+        return found
+
+    def slide():
+        if station.phases[-1:] == ["preload"]:
+            slid[0] = 0.004
+
+    observer._see, station.tick = see, slide
+    result = station.run(observer=observer)
+    assert result.status == "slipped" and len(station.waypoints) == 1
+    assert "contact 'corner' has slipped by 4.0 mm (slip-) since touch-down" in result.reason
 
 
 # -- a go that nobody sees ---------------------------------------------------------------------------------------------

@@ -167,3 +167,73 @@ def test_the_noise_of_tags_is_no_slip(moving, request):
 
     for _ in range(25):
         assert watch(plan, seen(plan.go, tag), seen(plan.eo, np.zeros(3)), tolerance) is None
+
+
+# -- before the first waypoint -----------------------------------------------------------------------------------------
+
+
+def before_touch(plan):
+    monitor = ContactMonitor(plan, TOLERANCE, 30.0)
+    monitor.before_touch(plan.preload_eo[0])
+    return monitor
+
+
+def measured(plan, slid=(0.0, 0.0, 0.0), step=0, wrench=None):
+    """Both objects as planned at a waypoint, but moved together by ``slid`` (3,)."""
+    off = np.array(slid)
+    push = plan.wrench[step] if wrench is None else np.array(wrench)
+    return PlanarState(plan.ee[step], plan.go[step] + off, plan.eo[step] + off, push)
+
+
+def test_an_object_that_slid_in_the_preload_has_slipped_at_the_first_waypoint(tipping):
+    found = before_touch(tipping).check(0, measured(tipping, [0.004, 0.0, 0.0]), np.zeros(2))
+    assert found is not None and (found.status, found.contact, found.step) == ("slipped", "ground right", 0)
+    assert found.reason == "waypoint 0: contact 'ground right' has slipped by 4.0 mm (slip-) since touch-down"
+
+
+def test_an_object_that_slid_away_from_under_the_force_has_slipped_and_not_lost_its_contact(tipping):
+    found = before_touch(tipping).check(0, measured(tipping, [0.02, 0.0, 0.0], wrench=[0.0, 0.0, 0.0]), np.zeros(2))
+    assert found is not None and (found.status, found.contact) == ("slipped", "ground right")
+
+
+def test_one_contact_that_slips_is_told_before_another_that_opens(tipping):
+    gone = measured(tipping, [0.004, 0.0, 0.0])
+    gone = replace(gone, go=gone.go - np.array([0.03, 0.0, 0.0]))
+    found = before_touch(tipping).check(1, gone, np.zeros(2))
+    assert found is not None and (found.status, found.contact) == ("slipped", "ground right")
+
+
+def test_an_object_that_the_go_met_where_it_stood_goes_on(tipping, turning):
+    for plan in (tipping, turning):
+        monitor = before_touch(plan)
+        for k in range(STEPS):
+            assert monitor.check(k, measured(plan, step=k), np.zeros(2)) is None
+
+
+def test_a_go_that_lands_elsewhere_on_an_object_that_stands_has_not_slipped(turning):
+    elsewhere = measured(turning)
+    elsewhere = replace(elsewhere, go=elsewhere.go + np.array([0.003, 0.0, 0.0]))
+    assert before_touch(turning).check(0, elsewhere, np.zeros(2)) is None
+
+
+def test_an_object_that_is_to_slide_may_be_pushed_along_by_the_preload(turning):
+    modes = ((Mode.STICK, Mode.SLIP_NEGATIVE, Mode.SLIP_NEGATIVE),) * STEPS
+    along = since(0, [0.02, 0.0, 0.0])
+    pushed = replace(
+        turning,
+        go=turning.go + along,
+        eo=turning.eo + along,
+        contact_points=turning.contact_points + along[:, None, :2],
+        contact_modes=modes,
+    )
+    monitor = before_touch(pushed)
+    assert monitor.check(0, measured(pushed, [0.004, 0.0, 0.0]), np.zeros(2)) is None
+
+
+def test_a_slip_is_seen_before_it_is_checked_and_nothing_is_marked_by_looking(tipping):
+    monitor = ContactMonitor(tipping, TOLERANCE, 30.0)
+    assert not monitor.has_slipped(0, measured(tipping, [0.004, 0.0, 0.0]))  # there are no marks yet
+    assert monitor.check(0, measured(tipping), np.zeros(2)) is None  # and these are the first
+    assert monitor.has_slipped(1, measured(tipping, [0.004, 0.0, 0.0], 1))
+    assert not monitor.has_slipped(1, measured(tipping, [np.nan, 0.0, 0.0], 1))
+    assert monitor.check(1, measured(tipping, step=1), np.zeros(2)) is None

@@ -14,9 +14,25 @@ from estimation.tactile_pose import TactilePose
 from mechanics import se2
 from mechanics.elasticity import Elasticity
 from tests.control.test_trial import Station
+from tests.control.test_trial_witnesses import whole_observer
 
 #: of 0.02 mm and 0.01 deg
 GOOD = np.diag(np.array([2e-5, 2e-5, np.radians(0.01)]) ** -2)
+
+
+def seeing(world):
+    """A finger that sees where the object truly lies."""
+
+    class Seeing:
+        name = "truth"
+
+        def estimate(self, image, prior):
+            truth = world.truth()
+            pose = se2.between(truth.ee, truth.go)
+            return TactilePose(pose, np.linalg.inv(GOOD), GOOD, np.empty((0, 3)))
+
+    now = SimpleNamespace(capture=lambda: SimpleNamespace(stamp=SimpleNamespace(capture_ns=world.now_ns())))
+    return Finger(now, Seeing())  # pyright: ignore[reportArgumentType]
 
 
 def test_the_wrench_that_laws_are_told_is_about_the_grasp_centre_that_plans_speak_of(tmp_path):
@@ -28,17 +44,8 @@ def test_the_wrench_that_laws_are_told_is_about_the_grasp_centre_that_plans_spea
     world.regrasp(0)
     observer = station.observer()
 
-    class Seeing:
-        name = "truth"
-
-        def estimate(self, image, prior):
-            truth = world.truth()
-            pose = se2.between(truth.ee, truth.go)
-            return TactilePose(pose, np.linalg.inv(GOOD), GOOD, np.empty((0, 3)))
-
-    now = SimpleNamespace(capture=lambda: SimpleNamespace(stamp=SimpleNamespace(capture_ns=world.now_ns())))
     stiffness = station.plan.stiffness
-    observer.fingers = (Finger(now, Seeing()),)  # pyright: ignore[reportArgumentType]
+    observer.fingers = (seeing(world),)
     observer.state = StateEstimator(
         GraspFilter(observer.grasp), Elasticity(stiffness), observer.wrist_sensor, FreeAirLoad(0.1, np.zeros(2))
     )
@@ -51,3 +58,18 @@ def test_the_wrench_that_laws_are_told_is_about_the_grasp_centre_that_plans_spea
     assert observer.felt is not None
     about_fingers = observer.felt.wrench[2] - told[-1].wrench[2]
     assert abs(about_fingers) > 4e-3
+
+
+@pytest.mark.parametrize(("limit", "slips"), [(2.0, True), (20.0, False)])
+def test_fingers_alone_tell_that_an_object_without_a_tag_slips_in_them(tmp_path, limit, slips):
+    weak = tmp_path / "weak.yaml"
+    weak.write_text(f"fingers: {{force_limit: {limit}, torque_limit: 1}}")
+    station = Station(f"world.profile={weak}")
+    observer, world = whole_observer(station), station.world
+    observer.fingers = (seeing(world),)
+    observer.tags["go"] = ()
+    result = station.run(ClosedLoop, observer=observer, on_deviation="record")
+    assert [waypoint.measured.go for waypoint in station.waypoints] == [None] * len(station.waypoints)
+    assert bool(result.finger_slip) is slips
+    drift = result.drifts[len(station.waypoints) - 1]
+    assert drift.size_mm == pytest.approx(world.plant().finger_slip * 1e3, rel=0.1, abs=0.01)

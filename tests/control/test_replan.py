@@ -156,6 +156,18 @@ def test_an_extrinsic_object_that_stands_elsewhere_is_met_there():
     assert belief.grasp == pytest.approx(problem.grasp, abs=1e-7)
 
 
+def test_an_object_that_is_first_seen_farther_away_than_a_slip_has_slid_from_where_it_was_planned():
+    problem, whole = made("extrinsic_pivoting", {"disturbance": 0.0})
+    belief, state = Belief(problem, PARTLY), as_planned(whole, 2)
+    slid = with_force(moved(state, by=np.array([5e-3, 0]), eo=True), problem, [-0.6, 1.0])
+    belief.in_contact(2, slid, at(problem, 2))
+    weight = problem.eo_body.mass * 9.81
+    assert belief.mu[1] == pytest.approx(max(0.6 / (1.0 + weight), 0.4))  # half of what was planned, at least
+    near = Belief(problem, PARTLY)
+    near.in_contact(2, moved(state, by=np.array([2e-3, 0]), eo=True), at(problem, 2))
+    assert near.mu[1] == pytest.approx(0.8)
+
+
 def test_an_extrinsic_object_that_is_not_seen_is_where_it_was_planned():
     problem, whole = made("extrinsic_pivoting", {"disturbance": 0.0})
     state, belief = as_planned(whole, 2), Belief(problem, ALL)

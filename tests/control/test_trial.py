@@ -45,6 +45,7 @@ class Station:
         self.events: list[tuple[str, str]] = []
         self.phases: list[str] = []
         self.waypoints: list[WaypointRecord] = []
+        self.felt: list[np.ndarray] = []
 
     def observer(self):
         camera, wrist = self.devices["camera"], self.devices["wrist_ft"]
@@ -65,6 +66,7 @@ class Station:
             phase=lambda name, _: self.phases.append(name),
             event=lambda level, text: self.events.append((level, text)),
             tick=self.tick,
+            felt=self.felt.append,
         )
         trial = Trial(
             "t",

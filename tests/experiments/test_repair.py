@@ -24,7 +24,7 @@ from mechanics.yaml_input import InputError
 ONE = ("--set", "stages.1.controllers=[open_loop]", "--set", "stages.1.trials=2")
 MANY = (*ONE[:-1], "stages.1.trials=12")
 #: of a row, what only the run itself knew
-OWN = {"go_pose", "law", "witness", "deviation", "rebuilt"}
+OWN = {"go_pose", "law", "witness", "finger_slip", "deviation", "rebuilt"}
 
 
 @pytest.fixture(scope="module")

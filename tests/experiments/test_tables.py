@@ -83,3 +83,12 @@ def test_an_extrinsic_object_has_a_column_where_there_is_one():
 
 def test_a_run_without_trials_says_so():
     assert "no trial was run" in shown([])
+
+
+def test_an_object_that_slipped_in_the_fingers_is_told_beside_its_trial_and_no_other():
+    slid = trial("open_loop") | {"finger_slip": {"mm": 1.6, "deg": 0.3, "detected": True, "reason": "waypoint 7: …"}}
+    held = trial("mine", 1) | {"finger_slip": {"mm": 0.2, "deg": 0.1, "detected": False, "reason": ""}}
+    lines = shown([slid, held, trial("other", 2)]).splitlines()
+    [told] = [n for n, line in enumerate(lines) if "slipped in the fingers" in line]
+    names = [n for n, line in enumerate(lines) if "pivot-" in line]
+    assert names[0] < told < names[1]

@@ -357,3 +357,12 @@ def test_colours_meet_wcag_contrast(scheme):
         assert contrast(colours[f"{body}-edge"], colours["page"]) >= 3.0
         for mark in ("ink", "stick", "slip", "wrench"):
             assert contrast(colours[mark], colours[body]) >= 3.0, (mark, body)
+
+
+def test_an_object_that_slipped_in_the_fingers_is_told_with_its_trial_and_in_the_verdict():
+    slid = {"name": "a", "status": "completed", "finger_slip": {"detected": True, "reason": "waypoint 7: it slipped"}}
+    held = {"name": "b", "status": "completed", "finger_slip": {"detected": False, "reason": ""}}
+    results = {"status": "done", "trials": [slid, held]}
+    assert [row["reason"] for row in summary.error_table(results)["rows"]] == ["waypoint 7: it slipped", ""]
+    assert "2 of 2 trials completed, in 1 of them the object slipped in the fingers" in summary.verdict(results).detail
+    assert summary.verdict({"status": "done", "trials": [held]}).detail == "1 of 1 trial completed."
