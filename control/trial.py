@@ -100,22 +100,29 @@ class Trial:
         """
         result = self._result
         try:
-            self._protocol()
-        except _Ended as end:
-            result.status, result.reason = end.status, end.reason
-            self._leave()
+            try:
+                self._protocol()
+            except _Ended as end:
+                result.status, result.reason = end.status, end.reason
+                self._leave()
         except CommandRefused as error:
-            result.status, result.reason = "stopped", str(error)
+            self._fails("stopped", error)
         except SimulationDiverged as error:
-            result.status, result.reason = "diverged", str(error)
+            self._fails("diverged", error)
         except DriverError as error:
-            result.status, result.reason, result.device = "device_failed", str(error), error.device
+            self._fails("device_failed", error)
         if result.status in ("stopped", "diverged", "device_failed"):
             with suppress(DriverError):  # one that does not answer is held by its server
                 self._observer.arm.hold()
         if result.status != "completed":
             self._watch.event("error", f"{result.status}: {result.reason}")
         return result
+
+    def _fails(self, status: str, error: DriverError) -> None:
+        """End ``status``; what had ended the trial before, where it failed only on the way out, is told with it."""
+        result = self._result
+        before = f"{result.status}: {result.reason}; then " if result.reason else ""
+        result.status, result.reason, result.device = status, f"{before}{error}", error.device
 
     # -- the phases ----------------------------------------------------------------------------------------------
 
