@@ -227,8 +227,10 @@ class Observer:
 
     def contact(self) -> ContactBelief | None:
         """Where the go is believed to be touched, of `state_now`; None where nobody looks for it."""
-        with self._look("contact"):
+        with self._look("contact") as told:
             self._known = now = self.state_now()
+            if now is not None:
+                told["state"] = now.told()
         if now is None or now.contact is None:
             return None
         found = now.contact.hypotheses

@@ -6,6 +6,7 @@ Every trial of every skill and controller runs through here, on the simulated st
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -32,10 +33,10 @@ from planning.plan import Plan
 class TrialResult:
     """How a trial ended (statuses of design §6) and what it recorded. ``plan`` is the plan as anchored.
 
-    ``witness`` is what the sensor under the table said of the wrist's force, at the waypoints where it said anything.
-    ``drifts`` tell how the object lay in the fingers at the waypoints, by number, where that was seen, and
-    ``finger_slip`` what was said of it when it had slipped there. ``deviation`` is the first that the law did not take
-    in.
+    ``device`` is the one that failed. ``witness`` is what the sensor under the table said of the wrist's force, at the
+    waypoints where it said anything. ``drifts`` tell how the object lay in the fingers at the waypoints, by number,
+    where that was seen, and ``finger_slip`` what was said of it when it had slipped there. ``deviation`` is the first
+    that the law did not take in.
     """
 
     status: str
@@ -46,6 +47,7 @@ class TrialResult:
     drifts: dict[int, Drift] = field(default_factory=dict)
     finger_slip: str = ""
     deviation: Deviation | None = None
+    device: str = ""
 
 
 @dataclass
@@ -91,26 +93,36 @@ class Trial:
         self._mover = Mover.of(observer.arm, clock, observer.arm_pose(), settings, watch.tick)
 
     def run(self) -> TrialResult:
-        """Run the whole protocol. Returns how it ended.
+        """Run the whole protocol. Returns how it ended; where anything failed, the arm is held.
 
         A device failure ends it ``device_failed``, a refusal or a limit ``stopped``, and a simulation whose state has
         become nonsense ``diverged``.
         """
         result = self._result
         try:
-            self._protocol()
-        except _Ended as end:
-            result.status, result.reason = end.status, end.reason
-            self._leave()
+            try:
+                self._protocol()
+            except _Ended as end:
+                result.status, result.reason = end.status, end.reason
+                self._leave()
         except CommandRefused as error:
-            result.status, result.reason = "stopped", str(error)
+            self._fails("stopped", error)
         except SimulationDiverged as error:
-            result.status, result.reason = "diverged", str(error)
+            self._fails("diverged", error)
         except DriverError as error:
-            result.status, result.reason = "device_failed", str(error)
+            self._fails("device_failed", error)
+        if result.status in ("stopped", "diverged", "device_failed"):
+            with suppress(DriverError):  # one that does not answer is held by its server
+                self._observer.arm.hold()
         if result.status != "completed":
             self._watch.event("error", f"{result.status}: {result.reason}")
         return result
+
+    def _fails(self, status: str, error: DriverError) -> None:
+        """End ``status``; what had ended the trial before, where it failed only on the way out, is told with it."""
+        result = self._result
+        before = f"{result.status}: {result.reason}; then " if result.reason else ""
+        result.status, result.reason, result.device = status, f"{before}{error}", error.device
 
     # -- the phases ----------------------------------------------------------------------------------------------
 

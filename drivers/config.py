@@ -4,13 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from contextlib import suppress
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self, cast
 
-from pydantic import BaseModel, BeforeValidator, Field, SerializeAsAny, create_model, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    Field,
+    GetJsonSchemaHandler,
+    SerializeAsAny,
+    create_model,
+    model_validator,
+)
+from pydantic_core import CoreSchema
 
 from drivers.fault import Fault
-from drivers.registry import driver, names
+from drivers.registry import OURS, driver, names
 from drivers.scene import Strict, TagMount, Vector3
+from mechanics.camera import CameraModel
+from mechanics.json_schema import Offered, Schema, reference, when
 from mechanics.yaml_input import Refusal, nearest, one_of, validated
 
 #: after this long without a sign of life somebody counts as dead [s]: ten seconds are too many beside an arm
@@ -19,15 +31,23 @@ LEASE = 1.0
 LEASE_IN_LOCKSTEP = 10.0
 
 
+def _profiles() -> list[str]:
+    return [file.stem for file in (Path(__file__).parent / "sim" / "profiles").glob("*.yaml")]
+
+
 class WorldConfig(Strict):
     """The simulated world. ``profile`` names the mismatch between the plant and what the planner believes of it."""
 
-    profile: str = "ideal"
+    profile: Annotated[str, Offered(_profiles, only=False)] = Field(
+        default="ideal", description="how far the plant is from what the planner believes: a name, or a file"
+    )
     stiffness_scale: float = Field(default=1.0, gt=0, description="the plant's stiffness over the planner's")
     friction_scale: dict[Literal["go-ground", "go-eo", "eo-ground"], Annotated[float, Field(gt=0, le=10)]] = Field(
         default_factory=dict, description="the plant's friction over what it was when it was calibrated, by pair"
     )
-    clock: Literal["lockstep", "realtime"] = "lockstep"
+    clock: Literal["lockstep", "realtime"] = Field(
+        default="lockstep", description="the same seed gives the same figures; or the wall's pace"
+    )
     timestep: float = Field(default=0.001, gt=0, le=0.002, description="plant step [s]")
     faults: tuple[Fault, ...] = Field(default=(), description="what goes wrong, counted from each reset")
 
@@ -202,6 +222,11 @@ class TagCameraConfig(DeviceConfig, frozen=True):
     position: Vector3
     look_at: Vector3
 
+    @property
+    def model(self) -> CameraModel:
+        """The camera as it is described here. Raises ValueError where it looks nowhere, or straight up or down."""
+        return CameraModel.looking_at(self.position, self.look_at, self.focal, self.width, self.height)
+
 
 def _usual_indentation(given: dict[str, Any]) -> float:
     return 0.0008 if given.get("sensor") == "gelslim" else 0.012
@@ -265,6 +290,30 @@ def _device(data: Any) -> DeviceConfig:
     return data if isinstance(data, DeviceConfig) else validated(device_model(data), data, at=())
 
 
+class _AnyDevice:
+    """The schema of a device's entry: by its kind, or by its driver. Of drivers of other packages nothing is known."""
+
+    @staticmethod
+    def __get_pydantic_json_schema__(_core: CoreSchema, handler: GetJsonSchemaHandler) -> Schema:
+        known = {name: driver(name).config for name in OURS}
+        return {
+            "type": "object",
+            "properties": {
+                "kind": {"type": "string", "enum": list(SIMULATED)},
+                "backend": {"type": "string", "enum": list(BACKENDS), "default": "sim"},
+                "driver": {"anyOf": [{"enum": list(OURS)}, {"type": "string"}]},
+            },
+            "required": ["kind"],
+            "allOf": [
+                *(when({"kind": kind, "backend": None}, reference(SIMULATED[kind], handler)) for kind in SIMULATED),
+                *(when({"kind": kind, "backend": "sim"}, reference(SIMULATED[kind], handler)) for kind in SIMULATED),
+                *(when({"kind": kind, "backend": "replay"}, reference(REPLAYED[kind], handler)) for kind in REPLAYED),
+                when({"backend": "real"}, {"required": ["driver"]}),
+                *(when({"backend": "real", "driver": name}, reference(known[name], handler)) for name in known),
+            ],
+        }
+
+
 class LogConfig(Strict):
     """What goes into the log: ``omit`` names streams to leave out, ``flush`` its period to disk [s]."""
 
@@ -275,11 +324,13 @@ class LogConfig(Strict):
 class StationConfig(Strict):
     """A station: its devices, where they meet, and, in simulation, the world behind them."""
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    world: WorldConfig | None = None
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", description="topics and calibration files carry it")
+    world: WorldConfig | None = Field(default=None, description="the simulated world, where there is one")
     bus: BusConfig = BusConfig()
-    devices: dict[str, Annotated[SerializeAsAny[DeviceConfig], BeforeValidator(_device)]]
-    table_tags: tuple[TagMount, ...] = ()
+    devices: dict[str, Annotated[SerializeAsAny[DeviceConfig], BeforeValidator(_device), _AnyDevice]] = Field(
+        description="each device by its name"
+    )
+    table_tags: tuple[TagMount, ...] = Field(default=(), description="AprilTags on the table, in W [m]")
     log: LogConfig = LogConfig()
 
     @property

@@ -104,7 +104,14 @@ class DeviceHost:
     def _desk(self) -> Desk:
         bus = self.config.bus
         views = ViewRates(bus.view_rate, bus.image_view_rate)
-        return Desk(self.bus, self.config.name, now_ns=time.time_ns, lease=self.config.lease, views=views)
+        return Desk(
+            self.bus,
+            self.config.name,
+            now_ns=time.time_ns,
+            steady_ns=time.monotonic_ns,
+            lease=self.config.lease,
+            views=views,
+        )
 
     def _server(self, desk: Desk, device: Device) -> DeviceServer:
         if not isinstance(device, Arm):

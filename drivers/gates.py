@@ -36,15 +36,32 @@ _ASKED = "command a set-point"
 
 @dataclass(frozen=True)
 class _Goal:
-    """The last accepted set-point: where the arm is going, how fast it arrives, and when [ns]."""
+    """The last accepted set-point: where the arm is going, how fast it arrives, and when [ns].
+
+    It goes there from ``start`` (pose, twist), where it was at ``since_ns``. ``due_ns`` is when it would arrive if it
+    had waited for the set-point before: a commander that is in a hurry gets ahead of the time by that.
+    """
 
     pose: Array
     twist: Array
     at_ns: int
+    start: tuple[Array, Array]
+    since_ns: int
+    due_ns: int
 
     @property
     def moves(self) -> bool:
         return bool(self.twist.any())
+
+    def planned(self, now_ns: int) -> tuple[Array, Array]:
+        """Pose and twist (3,) by ``now_ns``, along the cubic that arms follow from set-point to set-point."""
+        T = max((self.at_ns - self.since_ns) * NANO, SHORTEST)
+        s = min(max((now_ns - self.since_ns) * NANO / T, 0.0), 1.0)
+        (p, v), w = self.start, self.twist
+        step = self.pose - p
+        step[2] = se2.wrap(step[2])
+        pose = p + (3 - 2 * s) * s * s * step + s * (1 - s) * T * ((1 - s) * v - s * w)
+        return pose, 6 * s * (1 - s) / T * step + (1 - s) * (1 - 3 * s) * v + s * (3 * s - 2) * w
 
 
 @dataclass
@@ -56,13 +73,17 @@ class _Witness:
     capture_ns: int = 0
     share: float = 0.0  # of its limits, by its newest reading
     over: int = 0  # readings in a row beyond them
+    saturated: bool = False
     forgiven: float = 0.0  # the share at which a stop was released
     fast: tuple[float, ...] | None = None
     slow: tuple[float, ...] = ()
 
 
 class Gates:
-    """The gates of one arm. Every method may be called from any thread; times are the station's, in ns.
+    """The gates of one arm. Every method may be called from any thread; times are in ns.
+
+    ``now_ns`` is of a clock that nobody sets, so that no correction of the time hides a silence; ``wall_ns`` is the
+    station's, in which set-points and readings are stamped. In a simulated world they are one and the same.
 
     ``witnesses`` are the sources of force readings by name, each with its period [s], None where it may be silent.
     ``patience`` [s] is the least that a silence lasts: what a network delays is not lost yet. ``reachable(pose)`` says
@@ -113,16 +134,18 @@ class Gates:
         with self._lock:
             self._sequence, self._goal = -1, None
 
-    def restart(self, now_ns: int, pose: Array | None = None) -> None:
+    def restart(self, now_ns: int, pose: Array | None = None, wall_ns: int | None = None) -> None:
         """Time and force begin anew, with the arm at ``pose`` if that is known. A latched stop stays."""
+        wall_ns = now_ns if wall_ns is None else wall_ns
         with self._lock:
-            self._goal, self._at = None, pose
+            self._goal = None
+            self.at(pose)
             for source, witness in self._witnesses.items():
-                self._witnesses[source] = _Witness(witness.period, now_ns, now_ns)
+                self._witnesses[source] = _Witness(witness.period, now_ns, wall_ns)
 
-    def at(self, pose: Array) -> None:
-        """Where the arm is (3,), by its newest reading."""
-        self._at = pose
+    def at(self, pose: Array | None) -> None:
+        """Where the arm is (3,), by its newest reading; None where that says nothing."""
+        self._at = pose if pose is not None and all(map(math.isfinite, pose)) else None
 
     def rested(self) -> None:
         """The arm was held: the next set-point is measured from where it is."""
@@ -131,19 +154,20 @@ class Gates:
 
     # -- the commander's set-points --------------------------------------------------------------------------------
 
-    def admit(self, target: ArmTarget, sent_ns: int, now_ns: int) -> None:
+    def admit(self, target: ArmTarget, sent_ns: int, now_ns: int, wall_ns: int | None = None) -> None:
         """Let a set-point pass, or raise CommandRefused; DeviceTimeout where a witness of force is silent.
 
-        ``sent_ns`` is when its commander sent it. What passes counts as accepted once `accept` is told so.
+        ``sent_ns`` is when its commander sent it, on the wall. What passes counts as accepted once `accept` is told so.
         """
+        wall_ns = now_ns if wall_ns is None else wall_ns
         with self._lock:
             for gate, check in (
                 ("finite", lambda: self._finite(target)),
                 ("sequence", lambda: self._in_sequence(target)),
-                ("age", lambda: self._fresh(sent_ns, now_ns)),
-                ("witness", lambda: self._witnessed(now_ns)),
+                ("age", lambda: self._fresh(sent_ns, wall_ns)),
+                ("witness", lambda: self._witnessed(now_ns, wall_ns)),
                 ("workspace", lambda: self._within(target.pose)),
-                ("motion", lambda: self._gentle(target)),
+                ("motion", lambda: self._gentle(target, now_ns)),
             ):
                 with self.counting(gate):
                     check()
@@ -160,13 +184,28 @@ class Gates:
             raise
 
     def accept(self, target: ArmTarget, now_ns: int) -> None:
-        """The arm has taken a set-point."""
+        """The arm has taken a set-point. One that a stop overtook leads nowhere."""
         with self._lock:
             self._accepted += 1
-            self._held = ""
             self._sequence = target.sequence
+            if self._stopped:
+                return
+            goal, lasts, pose = self._goal, round(target.duration / NANO), np.asarray(target.pose, float)
+            begins, start = now_ns, (pose if self._at is None else self._at, np.zeros(3))
+            if goal is not None:
+                start = goal.planned(now_ns)
+                begins = max(now_ns, goal.due_ns) if self._follows(goal, target, now_ns) else now_ns
             twist = np.asarray(target.twist, float)
-            self._goal = _Goal(np.asarray(target.pose, float), twist, now_ns + round(target.duration / NANO))
+            self._goal = _Goal(pose, twist, now_ns + lasts, start, now_ns, begins + lasts)
+            self._held = ""
+
+    def _follows(self, goal: _Goal, target: ArmTarget, now_ns: int) -> bool:
+        """Whether a set-point goes on from ``goal``, though it may come a little early, and not in its place.
+
+        Early by its own duration at most, and what a network delays: a commander that was held up for a period makes up
+        for it with the next. All that it gets ahead of the time counts.
+        """
+        return (goal.due_ns - now_ns) * NANO <= target.duration * _ROUNDING + self._patience
 
     def _refuse(self, reason: str, remedy: str) -> None:
         raise CommandRefused(self.name, _ASKED, reason, remedy)
@@ -180,8 +219,8 @@ class Gates:
         if target.sequence <= self._sequence:
             self._refuse(f"target {target.sequence} came after {self._sequence}", "Count targets up within a lease")
 
-    def _fresh(self, sent_ns: int, now_ns: int) -> None:
-        age = (now_ns - sent_ns) * NANO
+    def _fresh(self, sent_ns: int, wall_ns: int) -> None:
+        age = (wall_ns - sent_ns) * NANO
         if abs(age) > self.limits.age:
             when = f"{age:.2f} s ago" if age > 0 else f"{-age:.2f} s in the future"
             self._refuse(
@@ -189,12 +228,12 @@ class Gates:
                 "See what holds the commander up, and that the clocks of both machines agree",
             )
 
-    def _witnessed(self, now_ns: int) -> None:
+    def _witnessed(self, now_ns: int, wall_ns: int) -> None:
         for source, witness in self._witnesses.items():
             if witness.period is None:
                 continue
             longest = self.limits.silence or max(CONFIRMED * witness.period, self._patience)
-            silent, age = (now_ns - witness.heard_ns) * NANO, (now_ns - witness.capture_ns) * NANO
+            silent, age = (now_ns - witness.heard_ns) * NANO, (wall_ns - witness.capture_ns) * NANO
             if silent > longest or age > max(self.limits.age, longest):
                 raise DeviceTimeout(
                     source,
@@ -218,14 +257,21 @@ class Gates:
         if reason := self._reachable(pose):
             self._refuse(reason, "Plan where the arm's joints can go")
 
-    def _gentle(self, target: ArmTarget) -> None:
-        """Step, speed and acceleration, of the motion that leads from the set-point before to this one."""
+    def _gentle(self, target: ArmTarget, now_ns: int) -> None:
+        """Step, speed and acceleration, of the motion that leads from the set-point before to this one.
+
+        One that comes in the place of the set-point before, while the arm is still on its way there, is judged from
+        where the arm is by then.
+        """
         limits, goal = self.limits, self._goal
-        start = self._at if goal is None else goal.pose
+        if goal is not None and not self._follows(goal, target, now_ns):
+            start, before = goal.planned(now_ns)
+        else:
+            start = self._at if goal is None else goal.pose
+            before = np.zeros(3) if goal is None or self._held else goal.twist
         if start is None:
-            self._refuse("the arm has not yet told where it is", "Wait for its first reading")
+            self._refuse("the arm has not told where it is", "Wait for a reading of its pose that can be trusted")
             return
-        before = np.zeros(3) if goal is None or self._held else goal.twist
         step = np.asarray(target.pose, float) - start
         step[2] = se2.wrap(step[2])
         T, twist = target.duration, np.asarray(target.twist, float)
@@ -242,9 +288,9 @@ class Gates:
             far = max(math.hypot(value[0], value[1]) for value in values)
             round_ = max(abs(float(value[2])) for value in values)
             remedy = f"Go there in smaller or slower steps, or raise `limits` of '{self.name}' in the station file"
-            if far > limit * _ROUNDING:
+            if not far <= limit * _ROUNDING:  # what is no number at all passes no gate
                 self._refuse(f"{what} of {far:.3g} m{unit}, the limit is {limit:g} m{unit}", remedy)
-            if round_ > turn * _ROUNDING:
+            if not round_ <= turn * _ROUNDING:
                 angles = f"{math.degrees(round_):.3g} deg{unit}, the limit is {math.degrees(turn):g} deg{unit}"
                 self._refuse(f"turning {what} of {angles}", remedy)
 
@@ -260,12 +306,20 @@ class Gates:
         """Release a latched stop.
 
         What is beyond a limit by now stops the arm again only if it grows by a tenth, until it has been within it
-        once: the arm must be able to leave what it presses on.
+        once: the arm must be able to leave what it presses on. Of a sensor that is saturated nobody knows whether it
+        grows, so that one stops the arm again.
         """
         with self._lock:
             self._stopped = self._held = ""
+            self._goal = None
             for witness in self._witnesses.values():
-                witness.forgiven, witness.over = witness.share if witness.share > 1 else 0.0, 0
+                leaves = witness.share > 1 and not witness.saturated
+                witness.forgiven, witness.over = witness.share if leaves else 0.0, 0
+
+    def unheld(self) -> None:
+        """The arm could not be held, as `watch` had asked for: it will ask again."""
+        with self._lock:
+            self._held = ""
 
     def watch(self, now_ns: int) -> str:
         """The two watchdogs: "hold" or "stop" where a commander fell silent in the midst of a motion, else ""."""
@@ -284,7 +338,7 @@ class Gates:
             return ""
 
     def feel(self, source: str, reading: WrenchReading, now_ns: int) -> str:
-        """What a witness of force says; returns why the arm has to stop now, or ""."""
+        """What a witness of force says, heard at ``now_ns``; returns why the arm has to stop now, or ""."""
         fx, fy, fz, tx, ty, tz = reading.wrench.tolist()
         force, torque = math.hypot(fx, fy, fz), math.hypot(tx, ty, tz)
         with self._lock:
@@ -293,7 +347,8 @@ class Gates:
                 return ""  # it said nothing; silence has a gate of its own
             witness.heard_ns, witness.capture_ns = now_ns, reading.stamp.capture_ns
             witness.share = max(force / self.limits.force, torque / self.limits.torque)
-            if reading.stamp.status is Status.SATURATED:
+            witness.saturated = reading.stamp.status is Status.SATURATED
+            if witness.saturated:
                 witness.share = max(witness.share, 1.0 + 1e-9)  # who knows how far
             jumped = self._jump(witness, (fx, fy, fz), now_ns)
             if self._stopped:
@@ -303,12 +358,12 @@ class Gates:
             if witness.share <= 1:
                 witness.over, witness.forgiven = 0, 0.0
                 return ""
-            if witness.share <= 1.1 * witness.forgiven:
+            if witness.share <= 1.1 * witness.forgiven and not witness.saturated:
                 return ""
             witness.over += 1
             if witness.over < (1 if witness.period is None else CONFIRMED):
                 return ""
-            if reading.stamp.status is Status.SATURATED:
+            if witness.saturated:
                 return f"{source} is saturated"
             return (
                 f"{source} measures {force:.1f} N and {torque:.2f} N·m, "

@@ -24,7 +24,8 @@ _PATIENCE = 0.1
 _LATENCY = 0.1
 #: a rate is what comes in this time [s], and less than this share of what was declared is too little
 _SPAN, _SHARE = 0.5, 0.9
-_WORDS = {
+#: what a reading's status says to a person
+WORDS = {
     Status.STALE: "its value is stuck",
     Status.SATURATED: "it is saturated",
     Status.INVALID: "its readings are invalid",
@@ -102,7 +103,7 @@ class StationHealth:
         if age > longest + self._usual.setdefault(device.name, min(age, _LATENCY)):
             return Ailment(device.name, "age", f"no reading for {age:.3g} s; it should speak every {period:.3g} s")
         statuses = {status for _, status in heard[-CONFIRMED:]}
-        if len(heard) >= CONFIRMED and len(statuses) == 1 and (words := _WORDS.get(statuses.pop())):
+        if len(heard) >= CONFIRMED and len(statuses) == 1 and (words := WORDS.get(statuses.pop())):
             return Ailment(device.name, "status", words)
         if (now_ns - self._begin_ns) * NANO < span or len(heard) >= _SHARE * span / period - 1:
             return None

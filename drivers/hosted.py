@@ -1,7 +1,8 @@
 """The child's side of `drivers.hosting`: a process that serves a station for whoever started it.
 
-It reads one line of JSON from standard input (``{"config": …, "bound": bool}``), answers with one line (``{"ready":
-pid}`` or ``{"error": …}``) and ends when standard input does, at SIGTERM or SIGINT: with exit code 0.
+It reads one line of JSON from standard input (``{"config": …, "bound": bool}``), says that it begins
+(``{"begun": pid}``), answers with one line (``{"ready": pid}`` or ``{"error": …}``) and ends when standard input does,
+at SIGTERM or SIGINT: with exit code 0.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ def main(serve: Serve) -> int:
     try:
         order = json.loads(line)
         config = StationConfig.model_validate(order["config"])
+        _tell(begun=os.getpid())
         if order.get("bound", False):
             _die_with_parent()
 

@@ -21,7 +21,11 @@ from drivers.errors import NotConnected
 from drivers.wire.bus import Bus
 
 HOST_START = 20.0
-"""How long a simulated host may take to start [s]; it takes about one."""
+"""How long a simulated host may take to begin [s]; it takes about one."""
+
+HOST_READY = 120.0
+"""How long it may then take to serve [s]. It takes about one, and in a fresh installation ten, on a crowded machine
+forty: what the simulated devices compute with is compiled once."""
 
 HOST_STOP = 10.0
 """How long a host that was asked to end may take [s]."""
@@ -128,14 +132,22 @@ class HostProcess(StationHost):
 
     def _await(self, stdout: IO[bytes]) -> None:
         asked, remedy = "start its simulated host", "Run `extrinsic serve STATION` to see what it says"
-        if not select.select([stdout], [], [], HOST_START)[0]:
-            raise NotConnected(self._config.name, asked, f"not ready within {HOST_START:g} s", remedy)
-        line = stdout.readline()
-        said: dict[str, Any]
-        try:
-            said = json.loads(line)
-        except ValueError:
-            said = {"error": "it ended before it was ready. " + self.last_words()}
+        said: dict[str, Any] = {}
+        rest = b""
+        for patience in (HOST_START, HOST_READY):
+            while b"\n" not in rest:  # from the pipe itself: what a buffer holds no select would tell of
+                if not select.select([stdout], [], [], patience)[0]:
+                    raise NotConnected(self._config.name, asked, f"not ready within {patience:g} s", remedy)
+                if not (heard := os.read(stdout.fileno(), 65536)):
+                    break
+                rest += heard
+            line, _, rest = rest.partition(b"\n")
+            try:
+                said = json.loads(line)
+            except ValueError:
+                said = {"error": "it ended before it was ready. " + self.last_words()}
+            if "begun" not in said:
+                break
         if "ready" not in said:
             child = NotConnected(
                 said.get("device", "host"),

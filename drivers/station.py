@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -25,7 +24,7 @@ from drivers.wire.codec import encode_reading
 from drivers.wire.link import Link
 from drivers.wire.log import LogWriter
 from drivers.wire.remote import RemoteSensor
-from drivers.wire.session import address
+from drivers.wire.session import listening
 from drivers.wire.station_bus import refuse_open_door, station_bus
 from drivers.wire.streams import Publisher
 from drivers.wire.watch import Watch
@@ -34,7 +33,6 @@ from mechanics.readings import Array, Stamp, WrenchReading
 Hosting = Callable[[StationConfig], StationHost]
 """What makes the host of a simulated station."""
 
-_PROBE = 1.0
 _PROTOCOL = 2
 
 
@@ -206,16 +204,6 @@ class Connection:
         """Kill a host that no longer answers, before the bus waits for it to close in order."""
         if watch.gone and self.host is not None:
             self.host.kill()
-
-
-def listening(endpoint: str) -> bool:
-    """Whether anything accepts connections at an endpoint like ``tcp/127.0.0.1:7447``."""
-    where = address(endpoint)
-    try:
-        with socket.create_connection((where.hostname or "", where.port or 0), timeout=_PROBE):
-            return True
-    except OSError:
-        return False
 
 
 def _agree_on(config: StationConfig, name: str, link: Link) -> None:

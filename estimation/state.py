@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import bisect_left, insort
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -54,6 +55,12 @@ class State:
     ages: Mapping[str, float] = field(default_factory=dict)
     status: PoseStatus = PoseStatus.OK
     reason: str = ""
+
+    def told(self) -> dict[str, Any]:
+        """What the log is to have of it beside the records: the poses, the wrench, and how sure they are, for JSON."""
+        names = ("ee", "go", "go_covariance", "wrench", "wrench_covariance", "centre", "eo", "eo_covariance")
+        values = {name: getattr(self, name) for name in names}
+        return {name: np.asarray(value).tolist() for name, value in values.items() if value is not None}
 
 
 class NoState(ValueError):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from math import inf
 from pathlib import Path
 from types import MappingProxyType
@@ -13,10 +14,13 @@ from control.motion import PEAK
 from drivers.config import ArmConfig, ForceTorqueConfig, TactileConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
+from experiments import disk, in_view
 from experiments.calibrate.schema import CameraStage, FrictionStage
 from experiments.calibrate.store import Calibrations, load
 from experiments.faults.schema import FaultsStage
 from experiments.files import Resolved
+from experiments.files import load as load_experiment
+from experiments.json_output import beside, put
 from experiments.planning.files import plan_files
 from experiments.planning.make import resting_eo, task, try_start
 from experiments.planning.schema import PlanStage
@@ -29,6 +33,28 @@ from planning.skills.base import SkillTask
 
 #: the sensors that fingers can be
 FINGERS = get_args(TactileConfig.model_fields["sensor"].annotation)
+
+
+def main(experiment: str, station: str | None, sets: Sequence[str], json_file: Path | None) -> None:
+    """Show what an experiment would do, and write it as JSON where that was asked for; faults of its files, too.
+
+    Raises as `check`, once the JSON is written.
+    """
+    told: dict[str, object] = {"schema": 1, "experiment": experiment, "ok": False, "lines": [], "problems": []}
+    try:
+        resolved = load_experiment(experiment, station, sets)
+        told |= {"experiment": resolved.experiment.name, "station": resolved.station.name}
+        lines = check(resolved)
+    except InputError as error:
+        put(json_file, told | {"problems": [asdict(problem) for problem in error.problems]})
+        raise
+    except InfeasiblePlan as error:
+        put(json_file, told | {"infeasible": str(error)})
+        raise
+    put(json_file, told | {"ok": True, "lines": lines})
+    console = beside(json_file)
+    for line in lines:
+        console.print(line, soft_wrap=True, highlight=False)
 
 
 def check(
@@ -47,13 +73,16 @@ def check(
     problems = _device_problems(resolved) + _scene_problems(resolved)
     if problems:
         raise InputError(problems)
-    made = tasks(resolved, believed(resolved, calibrations), feasible)
+    disk.require_store(resolved)
+    known = believed(resolved, calibrations)
+    made = tasks(resolved, known, feasible)
     plans = plan_files(resolved, own)
     problems = [
         problem
         for eo in {*map(resting_eo, made.values()), *map(_resting_of_plan, plans.values())} - {None}
         for problem in _scene_problems(resolved, eo)
     ]
+    problems = problems or in_view.problems(resolved, known, made, plans)
     if problems:
         raise InputError(problems)
     experiment, station = resolved.experiment, resolved.station

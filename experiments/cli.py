@@ -8,12 +8,25 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
+from rich.markup import escape
 
-from experiments import kernels
-from experiments.command import Sets, StationName, commands
+from experiments import __version__, authoring, completion, kernels, station_commands
+from experiments.command import (
+    Benchmark,
+    CheckTargets,
+    Experiment,
+    JsonFile,
+    Run,
+    Scheduler,
+    Sets,
+    StationOption,
+    TableName,
+    commands,
+)
 from experiments.exit_codes import ExitCode
+from experiments.json_output import beside
 from experiments.lab.commands import app as lab
+from experiments.terminal import prepare, terminal
 
 app = typer.Typer(
     name="extrinsic",
@@ -27,12 +40,23 @@ app = typer.Typer(
 
 command = commands(app)
 app.add_typer(lab)
+app.add_typer(station_commands.app)
+app.add_typer(authoring.app)
 
-Experiment = Annotated[str, typer.Argument(metavar="EXPERIMENT", help="An experiment file, or a shipped one's name.")]
-StationOption = Annotated[
-    str | None,
-    typer.Option("--station", metavar="STATION", help="Run on this station, not the experiment's own."),
-]
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"extrinsic {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
 
 
 @command("extrinsic run grasped_pivoting --set world.stiffness_scale=0.8")
@@ -40,7 +64,9 @@ def run(
     experiment: Annotated[
         str | None,
         typer.Argument(
-            metavar="[EXPERIMENT]", help="An experiment file, or a shipped one's name; may be left out with --resume."
+            metavar="EXPERIMENT",
+            help="An experiment file, or a shipped one's name; may be left out with --resume.",
+            autocompletion=completion.experiments,
         ),
     ] = None,
     station: StationOption = None,
@@ -54,7 +80,12 @@ def run(
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option("--resume", metavar="RUN", help="Go on with the run in this folder where it was cut off."),
+        typer.Option(
+            "--resume",
+            metavar="RUN",
+            help="Go on with the run in this folder where it was cut off.",
+            autocompletion=completion.runs,
+        ),
     ] = None,
 ) -> None:
     """Run an experiment: plan, execute, log, measure, report."""
@@ -69,175 +100,111 @@ def run(
     chosen += [] if speed is None else [f"trial.speed={speed:g}"]
     if resume is not None:
         refuse_besides({"--set": sets, "--out": out, "--rehearse": rehearse, "--speed": speed})
-        outcome = go_on(resume, experiment, station, Console(stderr=True))
+        outcome = go_on(resume, experiment, station, terminal(stderr=True))
     elif experiment is None:
         raise InputError([Problem("run", None, "EXPERIMENT", "it is missing", "an experiment, or --resume RUN")])
     else:
-        outcome = runner.run(load(experiment, station, chosen), out, Console(stderr=True))
-    console = Console()
+        outcome = runner.run(load(experiment, station, chosen), out, terminal(stderr=True))
+    console = terminal()
     faults = outcome.results.get("faults")
     console.print("", faults_table(faults) if faults else error_table(outcome.results), "", sep="\n")
     if outcome.exit_code is not ExitCode.DONE:
-        Console(stderr=True, soft_wrap=True).print(f"[red]{outcome.results['status']}[/]: {outcome.reason}")
+        said = terminal(stderr=True, prose=True)
+        said.print(f"[red]{outcome.results['status']}[/]: {escape(outcome.reason)}")
+        for line in runner.what_next(outcome):
+            said.print(line, markup=False)
     console.print(f"report: {outcome.folder.report}", soft_wrap=True, highlight=False)
     raise typer.Exit(outcome.exit_code)
 
 
 @command("extrinsic check experiments/grasped_static.yaml --station sim")
-def check(experiment: Experiment, station: StationOption = None, sets: Sets = None) -> None:
+def check(experiment: Experiment, station: StationOption = None, sets: Sets = None, json_file: JsonFile = None) -> None:
     """Validate and resolve an experiment and dry-run its sequence; touches no device."""
-    from experiments.check import check as dry_run
-    from experiments.files import load
+    from experiments.check import main as dry_run
 
-    console = Console()
-    for line in dry_run(load(experiment, station, sets or [])):
-        console.print(line, soft_wrap=True, highlight=False)
-
-
-@command("extrinsic serve sim --set world.clock=realtime")
-def serve(
-    station: StationName,
-    devices: Annotated[
-        list[str] | None, typer.Argument(metavar="[DEVICE]...", help="Serve only these devices; all by default.")
-    ] = None,
-    sets: Sets = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Listen without keys where other machines can reach it.")
-    ] = False,
-) -> None:
-    """Put a station's devices on the bus, until Ctrl-C."""
-    from experiments.files import load_station
-    from experiments.serve import serve as serve_station
-
-    raise typer.Exit(serve_station(load_station(station, sets or [], devices or None), insecure=insecure))
-
-
-@command("extrinsic emulate emulated_lab")
-def emulate(station: StationName, sets: Sets = None) -> None:
-    """Start an emulated lab: a simulated plant behind devices that the real backends speak to, until Ctrl-C."""
-    from experiments.files import load_station
-    from experiments.serve import emulate as emulate_lab
-
-    raise typer.Exit(emulate_lab(load_station(station, sets or [])))
-
-
-@command("extrinsic status sim")
-def status(station: StationName, sets: Sets = None) -> None:
-    """Show every device of a station: alive, rate, age, faults."""
-    from drivers.status import station_certificates, station_status
-    from experiments.files import load_station
-    from experiments.tables import status_table
-
-    config = load_station(station, sets or [])
-    rows = station_status(config)
-    Console().print(status_table(rows, station_certificates(config)))
-    raise typer.Exit(ExitCode.DONE if all(row.alive for row in rows) else ExitCode.DEVICE_FAILED)
-
-
-@command("extrinsic stop sim")
-def stop(station: StationName, sets: Sets = None) -> None:
-    """Stop a station's arm now; it stays stopped until `recover`. Needs no lease, and no run's consent."""
-    from drivers.safety import stop as stop_arms
-    from experiments.files import load_station
-
-    for arm in stop_arms(load_station(station, sets or [])):
-        Console().print(f"{arm.name} is stopped: {arm.reason}", soft_wrap=True, highlight=False)
-
-
-@command("extrinsic recover sim")
-def recover(station: StationName, sets: Sets = None) -> None:
-    """Release a latched stop, once its reason is gone; nothing moves by that."""
-    from drivers.safety import recover as recover_arms
-    from experiments.files import load_station
-
-    for arm in recover_arms(load_station(station, sets or [])):
-        said = f"was stopped: {arm.reason}; it takes set-points again" if arm.reason else "was not stopped"
-        Console().print(f"{arm.name} {said}", soft_wrap=True, highlight=False)
-
-
-@command("extrinsic check-device lab1.yaml wrist_ft", name="check-device")
-def check_device(
-    station: StationName,
-    device: Annotated[str, typer.Argument(metavar="DEVICE", help="The device's name in the station file.")],
-    step: Annotated[
-        list[str] | None, typer.Option("--step", metavar="STEP", help="Take this step only; may be repeated.")
-    ] = None,
-    move: Annotated[bool, typer.Option("--move", help="Let it move: an arm 5 mm, a gripper open and close.")] = False,
-    reference: Annotated[
-        Path | None,
-        typer.Option("--reference", metavar="FILE", help="Take a finger's picture, untouched, into FILE (PNG)."),
-    ] = None,
-    yes: Annotated[
-        bool, typer.Option("--yes", help="Ask nobody: agree to what is asked for, leave out what needs a hand.")
-    ] = False,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the findings as JSON.")
-    ] = None,
-    sets: Sets = None,
-) -> None:
-    """Walk through the bring-up of one device: what to look at, what is measured, what it is worth."""
-    from experiments.check_device.checklist import check_device as walk_through
-    from experiments.check_device.person import whoever_is_here
-    from experiments.files import load_station
-
-    load_station(station, sets or [], [device])  # refuses one that the station has not
-    config, console = load_station(station, sets or []), Console()
-    person = whoever_is_here(console, yes=yes)
-    steps = tuple(step or ())
-    code = walk_through(
-        config, device, person, console, move=move, reference=reference, only=steps, json_file=json_file
-    )
-    raise typer.Exit(code)
+    dry_run(experiment, station, sets or [], json_file)
 
 
 @command("extrinsic report runs/grasped_pivoting-20260101T120000.000000")
 def report(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    run_folder: Run,
 ) -> None:
     """Rebuild a run's report from its log."""
+    from experiments.progress import Progress
     from experiments.report.build import build_report
     from experiments.run_folder import RunFolder
 
     folder = RunFolder.open(run_folder)
-    build_report(folder)
-    Console().print(f"report: {folder.report}", soft_wrap=True, highlight=False)
+    with Progress(terminal(stderr=True)).share("make the report") as heard:
+        build_report(folder, heard)
+    terminal().print(f"report: {folder.report}", soft_wrap=True, highlight=False)
 
 
 @command("extrinsic repair runs/grasped_pivoting-20260101T120000.000000")
 def repair(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    run_folder: Run,
 ) -> None:
     """Mend a log that was cut off, beside it; rebuild results.json and the report."""
     from experiments import repair as mending
+    from experiments.progress import Progress
 
-    mending.say(mending.repair(run_folder), Console())
+    mending.say(mending.repair(run_folder, Progress(terminal(stderr=True))), terminal())
 
 
 @command("extrinsic replay runs/grasped_pivoting-20260101T120000.000000 --check")
 def replay(
-    run_folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write the estimates as JSON.")
-    ] = None,
+    run_folder: Run,
+    json_file: JsonFile = None,
     check_same: Annotated[bool, typer.Option("--check", help="Exit with 1 when an estimate differs.")] = False,
 ) -> None:
     """Estimate a recorded run again, from its log, with the code of today; show what differs."""
     from experiments import replay as replaying
     from experiments.run_folder import RunFolder
 
-    raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, Console()))
+    raise typer.Exit(replaying.main(RunFolder.open(run_folder), json_file, check_same, beside(json_file)))
+
+
+@command("extrinsic view runs/grasped_pivoting-20260101T120000.000000 --web")
+def view(
+    target: Annotated[
+        str | None,
+        typer.Argument(metavar="RUN|STATION", help="A run folder or its log.mcap, or a station that is being served."),
+    ] = None,
+    web: Annotated[bool, typer.Option("--web", help="In the browser, at 127.0.0.1, in place of a window.")] = False,
+    port: Annotated[
+        int | None,
+        typer.Option("--port", min=1, max=65534, help="The page's port, 9090; its data take the next one."),
+    ] = None,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Say the page's address; open no browser.")] = False,
+    save: Annotated[
+        Path | None, typer.Option("--save", metavar="FILE.rrd", help="Write it to a file for Rerun, and show nothing.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", min=0.1, help="Look at a live station for so long; until Ctrl-C.")
+    ] = None,
+    foxglove_layout: Annotated[
+        Path | None,
+        typer.Option("--foxglove-layout", metavar="FILE", help="Write the layout for Foxglove to FILE, and end."),
+    ] = None,
+    sets: Sets = None,
+) -> None:
+    """Look at a recorded run, or at a live station, in Rerun: scene, pictures, wrenches, estimates, events."""
+    from experiments.view import command as viewing
+
+    options = viewing.Options(web=web, port=port, browser=not no_browser, save=save, seconds=seconds)
+    viewing.main(target, sets or [], options, foxglove_layout, terminal(stderr=True))
 
 
 @command("extrinsic bench sim --check")
 def bench(
-    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help="sim, estimation, planning, load or bus.")],
+    name: Benchmark,
     runs: Annotated[
         int | None,
         typer.Option("--runs", min=1, help="Measurements per figure of sim, estimation, planning; 5."),
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures as JSON.")] = None,
+    json_file: JsonFile = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Write BENCHMARK.json into DIR.")] = None,
-    check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
+    check_targets: CheckTargets = False,
     horizons: Annotated[
         str | None, typer.Option("--horizons", metavar="K,...", help="Steps of the problems of `planning`.")
     ] = None,
@@ -252,7 +219,7 @@ def bench(
     """Measure speed, accuracy and steadiness, figure beside target, in one run."""
     from experiments import bench as benchmarks
 
-    options = benchmarks.Options(runs, _horizons(horizons), minutes, viewers)
+    options = benchmarks.Options(runs, benchmarks.horizons_of(horizons), minutes, viewers)
     raise typer.Exit(benchmarks.main(name, options, json_file, out, check_targets))
 
 
@@ -269,16 +236,14 @@ def sweep(
     station: StationOption = None,
     sets: Sets = None,
     workers: Annotated[int | None, typer.Option("--workers", min=1, help="Processes on this machine; 2.")] = None,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of a Dask scheduler.")
-    ] = None,
+    scheduler: Scheduler = None,
     retries: Annotated[
         int, typer.Option("--retries", min=0, help="So often a job runs again whose worker or device failed.")
     ] = 2,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="The sweep's folder; one that was cut off goes on.")
     ] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the summary as JSON.")] = None,
+    json_file: JsonFile = None,
 ) -> None:
     """Run every combination of a grid, every seed and trial, on workers; one table of all trials."""
     from experiments.campaign.sweep import sweep as run_sweep
@@ -298,30 +263,15 @@ def sweep(
         retries=retries,
         out=out,
         json_file=json_file,
-        console=Console(),
-        said=Console(stderr=True),
+        console=beside(json_file),
+        said=terminal(stderr=True),
     )
     raise typer.Exit(code)
 
 
-def _horizons(text: str | None) -> tuple[int, ...] | None:
-    """Numbers of steps. Raises InputError for anything else."""
-    from mechanics.yaml_input import InputError, Problem
-
-    if text is None:
-        return None
-    words = text.split(",")
-    if not all(word.strip().isdecimal() and 1 <= int(word) <= 100_000 for word in words):
-        wrong, expected = f"{text!r} are no horizons", "whole numbers of steps, such as 40,200,1000"
-        raise InputError([Problem("bench", None, "--horizons", wrong, expected)])
-    return tuple(dict.fromkeys(int(word) for word in words))
-
-
 @command("extrinsic table pivoting --seed 1 --check")
 def table(
-    name: Annotated[
-        str, typer.Argument(metavar="TABLE", help="grasped, extrinsic, pivoting, optimizers, or a table file.")
-    ],
+    name: TableName,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the simulated laboratory and its trials.")] = 0,
     trials: Annotated[
         int | None, typer.Option("--trials", metavar="N", min=1, help="A part: so many trials of each trajectory.")
@@ -329,16 +279,12 @@ def table(
     runs: Annotated[str | None, typer.Option("--runs", metavar="RUN,...", help="A part: these runs only.")] = None,
     sets: Sets = None,
     workers: Annotated[int, typer.Option("--workers", min=1, help="Jobs at a time on this machine.")] = 2,
-    scheduler: Annotated[
-        str | None, typer.Option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, tcp://host:port.")
-    ] = None,
+    scheduler: Scheduler = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="The table's folder; one begun goes on.")
     ] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", metavar="FILE", help="Write table.json there, too.")
-    ] = None,
-    check_targets: Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")] = False,
+    json_file: JsonFile = None,
+    check_targets: CheckTargets = False,
 ) -> None:
     """Run a table of the paper: calibrate, run its trials, print our figures beside the paper's."""
     from experiments.table import run as tables
@@ -366,6 +312,7 @@ def _check_packages() -> str | None:
 
 def main() -> None:
     """Entry point."""
+    prepare(app)
     problem = _check_packages()
     if problem:
         sys.exit(f"extrinsic: {problem}")

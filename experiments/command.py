@@ -5,18 +5,60 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import wraps
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import typer
 
+from experiments import completion, shipped
 from experiments.exit_codes import ExitCode
 
 Command = TypeVar("Command", bound=Callable[..., None])
 
-StationName = Annotated[str, typer.Argument(metavar="STATION", help="A station file, or a shipped one's name.")]
+Experiment = Annotated[
+    str,
+    typer.Argument(
+        metavar="EXPERIMENT", help="An experiment file, or a shipped one's name.", autocompletion=completion.experiments
+    ),
+]
+StationName = Annotated[
+    str,
+    typer.Argument(
+        metavar="STATION", help="A station file, or a shipped one's name.", autocompletion=completion.stations
+    ),
+]
+StationOption = Annotated[
+    str | None,
+    typer.Option(
+        "--station",
+        metavar="STATION",
+        help="Run on this station, not the experiment's own.",
+        autocompletion=completion.stations,
+    ),
+]
+Run = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.", autocompletion=completion.runs)]
 Sets = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Set a key of the experiment or the station; may be repeated."),
+]
+Benchmark = Annotated[
+    str,
+    typer.Argument(metavar="BENCHMARK", help=f"{', '.join(shipped.BENCHMARKS)}.", autocompletion=completion.benchmarks),
+]
+TableName = Annotated[
+    str,
+    typer.Argument(
+        metavar="TABLE", help=f"{', '.join(shipped.tables())}, or a table file.", autocompletion=completion.tables
+    ),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option("--scheduler", metavar="tcp://HOST:PORT", help="Use the workers of a Dask scheduler."),
+]
+CheckTargets = Annotated[bool, typer.Option("--check", help="Exit with 1 when a target is missed.")]
+JsonFile = Annotated[
+    Path | None,
+    typer.Option("--json", metavar="FILE", help="Write what it found as JSON, too; - is standard output."),
 ]
 
 

@@ -174,14 +174,19 @@ class RunContext:
 
     @contextmanager
     def timed(self, devices: Devices) -> Iterator[None]:
-        """Add wall time and station time of the block to the results, whatever ends it."""
+        """Add wall time and station time of the block to the results, whatever ends it.
+
+        What a run took that was cut off and mended without its results is not known, nor is then the whole.
+        """
         wall, station_ns = time.perf_counter(), devices.clock.now_ns()
         try:
             yield
         finally:
             timing = self.results["timing"]
-            timing["execute_wall_s"] += time.perf_counter() - wall
-            timing["execute_station_s"] += (devices.clock.now_ns() - station_ns) * 1e-9
+            if timing["execute_wall_s"] is not None:
+                timing["execute_wall_s"] += time.perf_counter() - wall
+            if timing["execute_station_s"] is not None:
+                timing["execute_station_s"] += (devices.clock.now_ns() - station_ns) * 1e-9
 
     @property
     def opened(self) -> Devices | None:

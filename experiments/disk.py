@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from drivers.errors import DeviceFault
 from experiments import registries
+from experiments.calibrate import store
+from experiments.calibrate.schema import CalibrationStage
 from experiments.files import Resolved
+from experiments.json_output import STDOUT
 from experiments.schema import ExecuteStage
 from experiments.setup import has_fingers
 from mechanics.yaml_input import InputError, Problem
@@ -19,6 +24,7 @@ FLOOR = 200 * 10**6
 FELT, BLIND = 50 * 10**6, 5 * 10**6
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+_FORBIDDEN = (errno.EACCES, errno.EPERM, errno.ENOTDIR)
 
 
 def expected(resolved: Resolved) -> int:
@@ -47,9 +53,49 @@ def require_room(resolved: Resolved, folder: Path) -> None:
         raise InputError([Problem(str(folder), None, "--out", wrong, remedy)])
 
 
+def require_writable(file: Path | None, option: str) -> None:
+    """Raises InputError where ``file``, which an ``option`` names, cannot be written; leaves nothing behind."""
+    if file is None or file == STDOUT:
+        return
+    there = file.absolute().parent
+    try:
+        if file.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        while not there.exists() and there != there.parent:
+            there = there.parent
+        with TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        wrong, expected = f"cannot be written: {error.strerror or error}", "a file in a place you may write to"
+        raise InputError([Problem(str(file), None, option, wrong, expected)]) from None
+
+
+def not_kept(error: OSError, folder: Path) -> DeviceFault:
+    """What a campaign or a table ends with whose summary cannot be written."""
+    remedy = f"All that was run is in {folder}. Make room there, then start again with --out {folder}"
+    return DeviceFault("disk", f"write {error.filename or folder}", error.strerror or str(error), remedy)
+
+
+def require_store(resolved: Resolved) -> None:
+    """Raises InputError where the run calibrates, and the folder of the station's calibrations cannot be written."""
+    if not any(isinstance(stage, CalibrationStage) for stage in resolved.experiment.stages):
+        return
+    there = folder = store.folder_of(resolved).absolute()
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    wrong = ""
+    if not there.is_dir():
+        wrong = f"{there} is a file" if there != folder else "it is a file"
+    elif not os.access(there, os.W_OK | os.X_OK):
+        wrong = f"{there} cannot be written" if there != folder else "it cannot be written"
+    if wrong:
+        expected = "a folder that you may write to: calibrations of this station go there"
+        raise InputError([Problem(str(folder), None, "calibration.source", wrong, expected)])
+
+
 def is_full(error: OSError) -> bool:
-    """Whether a disk that is full, or takes nothing more, is to blame."""
-    return error.errno in _FULL
+    """Whether a disk that is full, or takes nothing more, or nothing from us, is to blame."""
+    return error.errno in (*_FULL, *_FORBIDDEN)
 
 
 def not_written(path: Path | str | None, why: str, run_folder: Path) -> DeviceFault:

@@ -19,6 +19,7 @@ from ruamel.yaml.comments import CommentedSeq
 import experiments
 from drivers.config import StationConfig, TactileConfig
 from drivers.sim.mismatch import load_profile, profile_names
+from experiments import shipped
 from experiments.schema import Experiment
 from mechanics import model_paths
 from mechanics.catalogue import CATALOGUE, SENSORS, ObjectModel, SensorModel, load_sensor
@@ -92,7 +93,8 @@ def load(experiment: str, station: str | None = None, sets: Sequence[str] = ()) 
     ``sets`` are ``key=value`` overrides: a key goes to the file whose schema has it; ``experiment.`` or ``station.``
     in front decides where both have it. Accepts what `dump_resolved` wrote, too. Raises InputError.
     """
-    document = read_yaml(locate(experiment, "experiment", EXPERIMENTS, EXPERIMENTS[:1]))
+    besides = shipped.no_experiments()
+    document = read_yaml(locate(experiment, "experiment", EXPERIMENTS, EXPERIMENTS[:1], besides))
     embedded: Document | None = None
     if set(document.data) == {"experiment", "station"} and isinstance(document.data["experiment"], dict):
         document, embedded = document.part("experiment"), document.part("station")

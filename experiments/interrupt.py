@@ -13,7 +13,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupt:
-    """While it is entered, the first of `SIGNALS` raises KeyboardInterrupt; later ones only say to wait.
+    """While it is entered, the first of `SIGNALS` raises KeyboardInterrupt; later ones only say to wait: ``said``.
 
     A SIGHUP that is ignored already stays so: that is what nohup asks for.
 
@@ -21,7 +21,8 @@ class Interrupt:
     which raises it again. Once `closing` was called nothing raises any more: the arm is being held and the log closed.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, said: str = "closing: the arm is held and the log is being written") -> None:
+        self._said = said
         self._requested = self._closing = False
         self._before: dict[int, object] = {}
 
@@ -39,7 +40,7 @@ class Interrupt:
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         if self._requested or self._closing:
             with suppress(OSError, ValueError):  # the terminal may have gone
-                sys.stderr.write("closing: the arm is held and the log is being written\n")
+                sys.stderr.write(f"{self._said}\n")
             return
         self._requested = True
         raise KeyboardInterrupt

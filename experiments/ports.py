@@ -1,4 +1,4 @@
-"""A bus of one's own on this machine, for stations that nobody else is to find."""
+"""Ports and a bus of one's own on this machine, for what nobody else is to find."""
 
 from __future__ import annotations
 
@@ -7,11 +7,16 @@ import socket
 from drivers.config import BusConfig
 
 
-def free_endpoint() -> str:
-    """``tcp/127.0.0.1:PORT`` with a port that was free a moment ago."""
+def free_port() -> int:
+    """A port of 127.0.0.1 that was free a moment ago."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return probe.getsockname()[1]
+
+
+def free_endpoint() -> str:
+    """``tcp/127.0.0.1:PORT`` with a port that was free a moment ago."""
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 def own_bus(bus: BusConfig) -> BusConfig:

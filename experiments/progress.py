@@ -12,6 +12,7 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     SpinnerColumn,
+    TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -19,6 +20,13 @@ from rich.progress import (
 from rich.progress import Progress as Bars
 
 STYLES = {"info": "", "warning": "yellow", "error": "red"}
+
+Heard = Callable[[float], None]
+"""What is told the share, from 0 to 1, of something long that is done."""
+
+
+def unheard(share: float) -> None:
+    """Where nobody waits for it."""
 
 
 def counted(console: Console, speed_over: float = 30.0) -> Bars:
@@ -75,7 +83,8 @@ class Progress:
             self.console.print(f"{escape(what)} ...")
             yield
             return
-        columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+        spinner = SpinnerColumn("line" if self.console.options.ascii_only else "dots")
+        columns = (spinner, TextColumn("{task.description}"), TimeElapsedColumn())
         with Bars(*columns, console=self.console) as bars:
             bars.add_task(escape(what), total=None)
             yield
@@ -90,6 +99,17 @@ class Progress:
         with counted(self.console) as bars:
             task = bars.add_task(escape(what), total=total)
             yield lambda: bars.advance(task)
+
+    @contextmanager
+    def share(self, what: str) -> Iterator[Heard]:
+        """One thing whose progress is a share from 0 to 1; call what is yielded with it."""
+        if not self.console.is_terminal:
+            yield unheard
+            return
+        columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("left"))
+        with Bars(*columns, TimeRemainingColumn(), console=self.console) as bars:
+            task = bars.add_task(escape(what), total=1.0)
+            yield lambda share: bars.update(task, completed=share)
 
     def say(self, level: str, text: str) -> None:
         """One line to the person."""

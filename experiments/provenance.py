@@ -7,7 +7,9 @@ import subprocess
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-PACKAGES = ("extrinsic", "numpy", "torch", "cvxpy", "cvxpylayers", "mujoco", "eclipse-zenoh", "mcap", "pupil-apriltags")
+from experiments import __version__
+
+PACKAGES = ("numpy", "torch", "cvxpy", "cvxpylayers", "mujoco", "eclipse-zenoh", "mcap", "pupil-apriltags")
 
 
 def provenance() -> dict:
@@ -35,7 +37,7 @@ def revision() -> str | None:
 
 
 def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
+    found = {"python": platform.python_version(), "extrinsic": __version__}
     for name in PACKAGES:
         try:
             found[name] = version(name)

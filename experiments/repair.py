@@ -24,6 +24,7 @@ from experiments.exit_codes import STATUS, ExitCode
 from experiments.files import Resolved, load
 from experiments.metrics import contact_of, errors_of
 from experiments.planning.files import FOLDER as PLANS
+from experiments.progress import Progress
 from experiments.report.build import build_report
 from experiments.report.collect import LoggedTrial, Logs, plan_of, read_logs
 from experiments.results_file import BEGUN, Begun, ShownResults, parse_json, read_json
@@ -66,7 +67,7 @@ class Repair:
         return [*told, f"results: {self.folder.results}", f"report:  {self.folder.report}"]
 
 
-def repair(path: Path) -> Repair:
+def repair(path: Path, progress: Progress | None = None) -> Repair:
     """Mend the run folder at ``path``; a healthy one, and one that was mended before, is left as it is.
 
     Raises InputError for what is no run folder and for a run that still goes on, DeviceFault where another file lies
@@ -75,10 +76,10 @@ def repair(path: Path) -> Repair:
     if not RunFolder(path).logs():
         RunFolder.open(path)
     with RunLock(path):
-        return _repair(_opened(path))
+        return _repair(_opened(path), progress or Progress(Console(quiet=True)))
 
 
-def _repair(folder: RunFolder) -> Repair:
+def _repair(folder: RunFolder, progress: Progress) -> Repair:
     resolved = load(str(folder.experiment))
     accounts = tuple(_mended(log) for log in folder.written_logs())
     results = _results(folder)
@@ -89,7 +90,8 @@ def _repair(folder: RunFolder) -> Repair:
     rebuilt: list[str] = []
     logs = Logs()
     if not before:
-        logs = read_logs(folder, _NO_TRUTH)
+        with progress.share("read the log") as heard:
+            logs = read_logs(folder, _NO_TRUTH, heard)
         results = results or _begun(folder, resolved)
         rebuilt = _add_trials(results, logs, resolved)
         if not whole:
@@ -97,7 +99,8 @@ def _repair(folder: RunFolder) -> Repair:
         results["repair"] = told
         write_json(folder.results, results)
     if not before or not folder.report.is_file():
-        build_report(folder)
+        with progress.share("make the report") as heard:
+            build_report(folder, heard)
     cut_off = tuple(trial.begin.trial for trial in logs.trials if trial.end is None)
     healthy = before and not torn
     return Repair(folder, accounts, tuple(rebuilt), cut_off, healthy, before, resolved.station.log.flush)

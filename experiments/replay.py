@@ -31,8 +31,11 @@ from experiments.calibrate.store import Calibrations
 from experiments.exit_codes import ExitCode
 from experiments.files import Resolved, load
 from experiments.fingers import fingers
+from experiments.json_output import put
 from experiments.looks import BEGIN
-from experiments.run_folder import RunFolder, write_json
+from experiments.progress import Heard, Progress, unheard
+from experiments.run_folder import RunFolder
+from experiments.terminal import terminal
 from mechanics import se2
 from mechanics.readings import Array
 from mechanics.records import ContactBelief, LookRecord, PlanarState, TrialRecord, WaypointRecord
@@ -76,8 +79,10 @@ class Again:
         return all(value <= SAME * scale[unit] for unit, value in self.differences().items())
 
 
-def estimates(folder: RunFolder) -> list[Again]:
+def estimates(folder: RunFolder, heard: Heard = unheard) -> list[Again]:
     """Every waypoint of a run's trials, estimated again, in their order. What was run again counts once.
+
+    ``heard`` is called with the share of the log that has been played.
 
     Raises InputError for a run without a log, and for one whose log does not say when it looked at its devices.
     """
@@ -93,6 +98,7 @@ def estimates(folder: RunFolder) -> list[Again]:
                 going = recording.step()
                 while records:
                     estimator.take(records.popleft())
+                    heard(recording.share)
             stop()
     except NotConnected as error:
         raise InputError([Problem(str(folder.path), None, "RUN", error.got, error.remedy)]) from None
@@ -273,16 +279,15 @@ def main(folder: RunFolder, json_file: Path | None, check: bool, console: Consol
 
     Raises InputError for what cannot be estimated again.
     """
-    found = estimates(folder)
+    with Progress(terminal(stderr=True)).share("estimate again") as heard:
+        found = estimates(folder, heard)
     for trial in dict.fromkeys(again.recorded.trial for again in found):
         console.print(_table(trial, [again for again in found if again.recorded.trial == trial]), "")
     differing = [again for again in found if not again.same]
     figures = (f"{value:.3g} {unit.replace('contact_mm', 'mm of contact')}" for unit, value in largest(found).items())
     said = f"{len(found)} waypoints estimated again, {len(differing)} differ; at most {', '.join(figures)}"
     console.print(said, soft_wrap=True, highlight=False)
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        write_json(json_file, as_json(found))
+    put(json_file, as_json(found))
     return ExitCode.FELL_SHORT if check and (differing or not found) else ExitCode.DONE
 
 

@@ -33,6 +33,7 @@ from experiments.run_folder import RunFolder
 from experiments.run_lock import RunLock
 from experiments.runner import Outcome, begun, carry_out
 from experiments.stages import CUT_OFF, has_diverged
+from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem
 
 #: so many differences of an experiment are named
@@ -63,7 +64,7 @@ def resume(
     Raises InputError where there is no run, where another process still runs it, or where ``experiment`` (with
     ``station``), if it is given, is not the experiment of the run. ``host`` as `experiments.runner.run` has it.
     """
-    console = console or Console(stderr=True)
+    console = console or terminal(stderr=True)
     folder = RunFolder.open(run)
     resolved = load(str(folder.experiment))
     _refuse_another(resolved, folder, experiment, station)

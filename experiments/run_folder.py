@@ -61,9 +61,12 @@ class RunFolder:
     def open(cls, path: Path) -> RunFolder:
         """An existing run folder. Raises InputError when there is none."""
         if not (path / "experiment.yaml").is_file():
-            raise InputError(
-                [Problem(str(path), None, "RUN", "no experiment.yaml in it, so no run folder", "a folder under runs/")]
-            )
+            why = "no experiment.yaml in it" if path.exists() else "it is not there"
+            wrong = f"{why}, so no run folder"
+            newest = max(Path("runs").glob("*/experiment.yaml"), key=lambda file: file.stat().st_mtime, default=None)
+            near = "" if newest is None else str(newest.parent)
+            expected = "a folder under runs/; `extrinsic run EXPERIMENT` makes one"
+            raise InputError([Problem(str(path), None, "RUN", wrong, expected, near)])
         return cls(path)
 
     def next_log(self) -> Path:

@@ -42,6 +42,7 @@ from experiments.results_file import BEGUN, Begun
 from experiments.run_folder import RunFolder, write_atomic, write_json
 from experiments.run_lock import RunLock
 from experiments.stages import STAGES, has_diverged, skip_stages
+from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem
 from planning.errors import InfeasiblePlan
 
@@ -113,7 +114,7 @@ def carry_out(
     host: Hosting = HostProcess,
 ) -> Outcome:
     """Run what ``results`` do not have yet, into ``folder``, whose lock is held; however it ends, it returns."""
-    console = console or Console(stderr=True)
+    console = console or terminal(stderr=True)
     outlive_terminal(console)
     _keep_what_is_here()
     code, reason = ExitCode.DONE, ""
@@ -154,9 +155,11 @@ def _stages(
         context = RunContext(resolved, calibrations, folder, results, log, progress, closing, ask, heed, host)
         code, reason = _carried_out(context, interrupt)
         cut_off = code is ExitCode.DEVICE_FAILED
+        interrupt.closing()
     except KeyboardInterrupt:
         code, reason = ExitCode.INTERRUPTED, INTERRUPTED
     except Exception as error:  # whatever it is: the arm is held, the log is closed, and the results say so
+        interrupt.closing()
         code, reason = _ended_by(error, folder)
     interrupt.closing()
     if context is not None:
@@ -252,6 +255,22 @@ def _finish(outcome: Outcome, console: Console) -> Outcome:
     except Exception as error:  # the run is over and its data are safe: say it and go on
         console.print(f"[yellow]the report could not be made: {error}[/]\n  extrinsic report {outcome.folder.path}")
     return outcome
+
+
+def what_next(outcome: Outcome) -> list[str]:
+    """The commands that help after a run that did not end as it should, a line each."""
+    folder, station = outcome.folder.path, outcome.results["station"]
+    go_on = f"go on with it: extrinsic run --resume {folder}"
+    match outcome.exit_code:
+        case ExitCode.INTERRUPTED:
+            return [go_on]
+        case ExitCode.DEVICE_FAILED:
+            return [f"how the devices are: extrinsic status {station}", go_on]
+        case ExitCode.STOPPED:
+            return [f"once the reason is gone: extrinsic recover {station}", go_on]
+        case ExitCode.INFEASIBLE:
+            return [f"what the task needs: extrinsic check {folder / 'experiment.yaml'}"]
+    return []
 
 
 def _ask(console: Console) -> Callable[[str], bool]:

@@ -6,16 +6,29 @@ sensor, a station) is looked up in `experiments.files`.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag, create_model, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    GetJsonSchemaHandler,
+    Tag,
+    create_model,
+    model_validator,
+)
+from pydantic_core import CoreSchema
 
 from control.settings import TrialSettings
 from experiments import registries
 from experiments.calibrate.schema import CalibrationStage, CalibrationUse, FrictionStage, Pair
 from experiments.faults.schema import FaultsStage, TimedFault
 from experiments.planning.schema import PlanStage, Slug
-from mechanics.catalogue import ObjectModel, SensorModel
+from mechanics.catalogue import CATALOGUE, SENSORS, ObjectModel, SensorModel
+from mechanics.json_schema import Offered, Schema, reference
 from mechanics.yaml_input import Refusal, nearest, one_of, validated
 
 Vector2 = tuple[float, float]
@@ -25,13 +38,18 @@ def _named_or_inline(value: Any) -> str:
     return "inline" if isinstance(value, dict | BaseModel) else "name"
 
 
+def _shipped(folder: Path, *more: str) -> Offered:
+    """The names of what is shipped in a folder; any other file will do as well."""
+    return Offered(lambda: [*more, *(file.stem for file in folder.glob("*.yaml"))], only=False)
+
+
 _NAME = Field(min_length=1, max_length=1000)
 ObjectReference = Annotated[
-    Annotated[Annotated[str, _NAME], Tag("name")] | Annotated[ObjectModel, Tag("inline")],
+    Annotated[Annotated[str, _NAME, _shipped(CATALOGUE)], Tag("name")] | Annotated[ObjectModel, Tag("inline")],
     Discriminator(_named_or_inline),
 ]
 SensorReference = Annotated[
-    Annotated[Annotated[str, _NAME], Tag("name")] | Annotated[SensorModel, Tag("inline")],
+    Annotated[Annotated[str, _NAME, _shipped(SENSORS, "auto")], Tag("name")] | Annotated[SensorModel, Tag("inline")],
     Discriminator(_named_or_inline),
 ]
 #: how the name of a plan file ends
@@ -48,14 +66,14 @@ class GraspConfig(_Model):
     ``auto``: so that an end of a tall box stays in the tactile picture, and for a GelSlim's smaller one a side, too.
     """
 
-    centre_mm: Vector2 | Literal["auto"] = "auto"
-    angle_deg: float = Field(default=0.0, ge=-180, le=180)
+    centre_mm: Vector2 | Literal["auto"] = Field(default="auto", description="the grasp centre [mm]")
+    angle_deg: float = Field(default=0.0, ge=-180, le=180, description="of the fingers' axes [deg]")
 
 
 class ReportConfig(_Model):
     """What the report shows. ``playback_rate`` is the frames kept of each second of station time [Hz]."""
 
-    playback_rate: float = Field(default=25.0, gt=0, le=200)
+    playback_rate: float = Field(default=25.0, gt=0, le=200, description="frames kept of each second [Hz]")
 
 
 class HealthConfig(_Model):
@@ -65,7 +83,7 @@ class HealthConfig(_Model):
     off is run again, where the device has come back within that time.
     """
 
-    on_fault: Literal["pause", "warn"] = "pause"
+    on_fault: Literal["pause", "warn"] = Field(default="pause", description="until it is well, or only tell")
     limit: float = Field(default=30.0, gt=0, le=86400, description="longest pause [s]")
 
 
@@ -87,14 +105,21 @@ class ExecuteStage(_Model):
     """
 
     stage: Literal["execute"]
-    plan: Annotated[str, _NAME]
-    controllers: Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_known_controllers)]
-    settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    plan: Annotated[str, _NAME] = Field(description="an earlier plan stage's name, or a plan file")
+    controllers: Annotated[
+        tuple[str, ...],
+        Field(min_length=1, description="each runs every trial"),
+        AfterValidator(_known_controllers),
+        Offered(registries.controllers),
+    ]
+    settings: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="the laws' figures, by the controller's name"
+    )
     restiffen: bool = Field(
         default=False,
         description="end-effector poses anew, from the go's and the forces, by the stiffness believed here",
     )
-    trials: int = Field(default=1, ge=1, le=10_000)
+    trials: int = Field(default=1, ge=1, le=10_000, description="so many under each controller")
     first: int = Field(default=0, ge=0, le=1_000_000, description="number of the first trial: the grasp is drawn by it")
     faults: tuple[TimedFault, ...] = Field(
         default=(), description="what goes wrong in each trial, where the station is simulated, and when"
@@ -109,6 +134,15 @@ class ExecuteStage(_Model):
         names = [name for name in data.get("controllers", ()) if isinstance(name, str) and name in known]
         fields: dict[str, Any] = {name: (known[name].Settings, known[name].Settings()) for name in names}
         return create_model("settings", __config__=_Model.model_config, **fields)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> Schema:
+        """As a file has it: settings by the laws' own models."""
+        found, laws = handler.resolve_ref_schema(handler(core)), registries.controllers()
+        models = {name: reference(laws[name].Settings, handler) for name in sorted(laws)}
+        settings = found["properties"]["settings"]
+        found["properties"]["settings"] = {**settings, "properties": models, "additionalProperties": False}
+        return found
 
     @model_validator(mode="after")
     def _settings_are_the_laws(self) -> ExecuteStage:
@@ -135,12 +169,18 @@ Stage = Annotated[PlanStage | ExecuteStage | FaultsStage | CalibrationStage, Fie
 class Experiment(_Model):
     """An experiment: what is held, what it touches, and what is done, in order."""
 
-    name: Slug
-    station: str = Field(default="sim", min_length=1, max_length=1000)
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    sensor: SensorReference = "auto"
-    grasped_object: ObjectReference
-    extrinsic_object: ObjectReference | None = None
+    name: Slug = Field(description="run folders and reports carry it")
+    station: Annotated[str, _shipped(Path(__file__).parent / "stations")] = Field(
+        default="sim", min_length=1, max_length=1000, description="the station it runs on: a name, or a file"
+    )
+    seed: int = Field(default=0, ge=0, lt=2**63, description="of everything that is drawn")
+    sensor: SensorReference = Field(
+        default="auto", description="the fingers' elasticity: a name, a file, or a mapping; auto: the station's fingers"
+    )
+    grasped_object: ObjectReference = Field(description="what the fingers hold: a name, a file, or a mapping")
+    extrinsic_object: ObjectReference | None = Field(
+        default=None, description="what it touches on the table: a name, a file, or a mapping"
+    )
     grasp: GraspConfig = GraspConfig()
     friction: dict[Pair, Annotated[float, Field(gt=0, le=10)]] = Field(
         default_factory=dict, description="Coulomb coefficients by pair, where they are not the objects' own"
@@ -149,7 +189,7 @@ class Experiment(_Model):
     health: HealthConfig = HealthConfig()
     rehearse: bool = Field(default=False, description="the plans' motions in free air in place of trials: --rehearse")
     trial: TrialSettings = Field(default_factory=lambda: TrialSettings.model_validate({}))
-    stages: Annotated[tuple[Stage, ...], Field(min_length=1)]
+    stages: Annotated[tuple[Stage, ...], Field(min_length=1)] = Field(description="what is done, in order")
     report: ReportConfig = ReportConfig()
 
     @model_validator(mode="after")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from rich.console import Console
-
 from drivers.config import StationConfig
+from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem
 
 
@@ -19,7 +18,7 @@ def serve(config: StationConfig, *, insecure: bool = False) -> int:
     what = f"serving {', '.join(config.devices)} at {config.bus.endpoint}; Ctrl-C ends it"
 
     def ready(*_: object) -> None:
-        Console(stderr=True).print(what, highlight=False, soft_wrap=True)
+        terminal(stderr=True).print(what, highlight=False, soft_wrap=True)
 
     if config.simulated:
         from drivers.sim import host

@@ -77,7 +77,7 @@ def _tried(
     while True:
         suspender.checkpoint()
         result = _one_trial(context, devices, plan, controller, stage, trial)
-        if result.status != "device_failed" or attempt == TRIES or not suspender.has_come_back():
+        if result.status != "device_failed" or attempt == TRIES or not suspender.has_come_back(result.device):
             return result
         context.results["trials"].pop()
         attempt += 1

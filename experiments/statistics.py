@@ -5,7 +5,7 @@ A value is a trial's: its waypoints hang together and are no sample of their own
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,6 +67,12 @@ def paired(values_a: Sequence[float], values_b: Sequence[float], level: float = 
     if a.shape != b.shape:
         raise ValueError(f"paired: expected as many values of either, received {a.shape} and {b.shape}")
     return mean((a - b).tolist(), level)
+
+
+def paired_over(a: Mapping[Hashable, float], b: Mapping[Hashable, float], level: float = LEVEL) -> Estimate | None:
+    """`paired` over the keys that both have; None where there is none."""
+    common = [key for key in a if key in b]
+    return paired([a[key] for key in common], [b[key] for key in common], level) if common else None
 
 
 def rate(successes: int, n: int, level: float = LEVEL) -> Rate:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from drivers.errors import DeviceFault
 from drivers.health import Ailment, StationHealth
+from drivers.interfaces import Arm
 from drivers.station import Devices
 from experiments.context import RunContext
 
@@ -46,23 +47,29 @@ class Suspender:
             )
         self._context.event("info", f"goes on after {waited:.3g} s")
 
-    def has_come_back(self) -> bool:
-        """Whether a device that cut a trial off was seen to be unwell, and is well again within the limit."""
-        if self._how.on_fault != "pause" or not self._health.ailments():
+    def has_come_back(self, device: str) -> bool:
+        """Whether the ``device`` that cut a trial off is well, as all others are, at once or within the limit.
+
+        An arm is not waited for: it was let go where it was, and a person looks before it moves. Nor is what is no
+        device of the station, such as the disk.
+        """
+        sensors = {known.name for known in self._devices.values() if not isinstance(known, Arm)}
+        if self._how.on_fault != "pause" or not sensors.issuperset(device.split(", ")):
             return False
         waited, left = self._wait()
         if not left:
-            self._context.event("info", f"the devices are well again after {waited:.3g} s: the trial is run again")
+            when = f"the devices are well again after {waited:.3g} s" if waited else f"{device} is well again"
+            self._context.event("info", f"{when}: the trial is run again")
         return not left
 
     def _wait(self) -> tuple[float, list[Ailment]]:
         """Let time pass until all is well or the limit is reached; how long it was [s], and what is still not well."""
-        waited, found = 0.0, self._health.ailments()
+        begin_ns, waited, found = self._devices.clock.now_ns(), 0.0, self._health.ailments()
         while found and waited < self._how.limit:
             if not all(self._health.reopen(ailment.device, LOOK) for ailment in found if ailment.kind == "gone"):
                 break
             self._devices.clock.sleep(LOOK)
-            waited += LOOK
+            waited = (self._devices.clock.now_ns() - begin_ns) * 1e-9  # opening a device again takes its time, too
             self._context.heed()
             found = self._health.ailments()
         return waited, found

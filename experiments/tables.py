@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
+from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from drivers.status import DeviceStatus
 from drivers.wire.security import WARNING_DAYS
@@ -59,7 +62,46 @@ def error_table(results: dict[str, Any]) -> Table:
         if printed is not None:
             name = controller if len(group) == 1 else ""
             table.add_row(name, "", "paper", *(_cell(printed.get(key)) for key in figures), style="dim")
+    for row in _differences(groups, figures, several):
+        table.add_section()
+        table.add_row(*row)
     return table
+
+
+def _differences(
+    groups: Mapping[tuple[str, str], Sequence[dict[str, Any]]], keys: Sequence[str], several: bool
+) -> Iterator[list[str]]:
+    """A line for each controller against its skill's first one, over two and more trials that both have: the mean
+    difference and its 95 % interval."""
+    first: dict[str, str] = {}
+    for (skill, controller), group in groups.items():
+        base = first.setdefault(skill, controller)
+        if controller == base or len(group) < 2:
+            continue
+        from experiments.statistics import paired_over  # scipy's statistics take a second to import
+
+        found = {key: paired_over(_by_trial(group, key), _by_trial(groups[skill, base], key)) for key in keys}
+        pairs = max((one.n for one in found.values() if one is not None), default=0)
+        if pairs > 1:
+            name = f"{controller} − {base}"
+            cells = [
+                "–" if one is None or one.low is None else f"{one.mean:+.2f}\n{one.low:+.2f}…{one.high:+.2f}"
+                for one in found.values()
+            ]
+            yield [f"{skill}, {name}" if several else name, f"{pairs} pairs", "measured\n95 %", *cells]
+
+
+def _by_trial(group: Sequence[dict[str, Any]], key: str) -> dict[Hashable, float]:
+    """A figure by the trial's number; and by how often it has come before, where a run has several plans of a skill."""
+    found: dict[Hashable, float] = {}
+    times: Counter[int] = Counter()
+    for trial in group:
+        number = trial.get("trial", 0)
+        figure = (trial["measured"] or {}).get(key)
+        if figure is not None:
+            found[number, times[number]] = figure["mean"]
+        times[number] += 1
+    return found
 
 
 def _rows(
@@ -91,8 +133,8 @@ def faults_table(rows: Sequence[dict[str, Any]]) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for name in ("fault", "device", "moment", "ended"):
         table.add_column(name, no_wrap=True)
-    table.add_column("moved on [ms]", justify="right")
-    table.add_column("force [N]", justify="right")
+    table.add_column(escape("moved on [ms]"), justify="right")
+    table.add_column(escape("force [N]"), justify="right")
     table.add_column("short", overflow="fold")
     for row in rows:
         fault = row["fault"]
@@ -112,26 +154,50 @@ def faults_table(rows: Sequence[dict[str, Any]]) -> Table:
     return table
 
 
-def status_table(rows: Sequence[DeviceStatus], certificates: Sequence[tuple[str, int]] = ()) -> Table:
-    """One line per device, then one per certificate, by its name and the days that it has left."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for name in ("device", "kind", "backend", "alive"):
+#: columns from which on a status table has room for notes
+_NOTES_BESIDE = 100
+#: and for the kinds of devices
+_KINDS = 72
+
+
+def status_table(
+    rows: Sequence[DeviceStatus],
+    certificates: Sequence[tuple[str, int]] = (),
+    *,
+    width: int = 120,
+    models: bool = True,
+) -> Group:
+    """One line per device, then one per certificate, by its name and the days that it has left.
+
+    In less than 100 columns (``width``) the notes stand below the table, in less than 72 the kinds are left out.
+    ``models``: whether devices say what they are, where there is room.
+    """
+    beside, kinds = width >= _NOTES_BESIDE, width >= _KINDS
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1) if beside else (0, 1, 0, 0), show_edge=False)
+    for name in ("device", "kind", "backend", "alive") if kinds else ("device", "alive"):
         table.add_column(name, no_wrap=True)
     for name in ("rate [Hz]", "age [s]", "gaps"):
-        table.add_column(escape(name), justify="right")
-    table.add_column("note")
+        table.add_column(escape(name), justify="right", no_wrap=True)
+    if beside:
+        table.add_column("note", overflow="fold")
+    below: dict[str, list[str]] = {}
+
+    def add(name: str, kind: Sequence[str], figures: Sequence[str], note: str, style: str | None) -> None:
+        if not beside and note:
+            below.setdefault(note, []).append(name)
+        cells = (escape(name), *(kind if kinds else ()), *figures, *((escape(note),) if beside else ()))
+        table.add_row(*cells, style=style)
+
     for row in rows:
-        table.add_row(
-            escape(row.name),
-            row.kind,
-            row.backend,
+        stopped = row.arm is not None and bool(row.arm.stopped)
+        figures = (
             "yes" if row.alive else "no",
             "–" if row.rate is None else f"{row.rate:.0f}",
             "–" if row.age is None else f"{row.age:.2f}",
             "–" if row.gaps is None else str(row.gaps),
-            escape(row.note),
-            style=None if row.alive else "red",
         )
+        style = "red" if stopped or not row.alive else "yellow" if row.condition else None
+        add(row.name, (row.kind, row.backend), figures, row.note if models and beside else "; ".join(row.notes), style)
     table.add_section()
     for name, days in certificates:
         valid, soon = days >= 0, days < WARNING_DAYS
@@ -139,5 +205,6 @@ def status_table(rows: Sequence[DeviceStatus], certificates: Sequence[tuple[str,
         if soon:
             note += "; `extrinsic lab renew` makes a new one"
         style = "yellow" if soon and valid else None if valid else "red"
-        table.add_row(escape(name), "certificate", "", "yes" if valid else "no", "", "", "", note, style=style)
-    return table
+        add(name, ("certificate", ""), ("yes" if valid else "no", "", "", ""), note, style)
+    notes = [Text(f"{', '.join(names)}: {note}") for note, names in below.items()]
+    return Group(table, *([Text()] if notes else []), *notes)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -359,11 +359,12 @@ def locate(
     kind: str,
     folders: Sequence[str | os.PathLike[str]],
     listed: Sequence[str | os.PathLike[str]] | None = None,
+    besides: Collection[str] = (),
 ) -> Path:
     """The file that ``name`` means: a path or a bare name, looked up in the current folder, then in ``folders``.
 
     Raises InputError with the names in ``listed`` (default: ``folders``), the folders that hold nothing but files of
-    this kind, and the nearest of them. ``kind`` says in words what is looked for.
+    this kind ``besides`` some, and the nearest of them. ``kind`` says in words what is looked for.
     """
     shown = (name if name.isprintable() and name else repr(name))[:200]
     searched = [Path(), *(Path(folder) for folder in folders)]
@@ -377,7 +378,7 @@ def locate(
                 if name and path.is_file():
                     return path
         shelves = [Path(folder) for folder in (folders if listed is None else listed)]
-        present = {p.stem for folder in shelves if folder.is_dir() for p in folder.glob("*.yaml")}
+        present = {p.stem for folder in shelves if folder.is_dir() for p in folder.glob("*.yaml")} - {*besides}
         wrong = "is a folder" if name and Path(name).is_dir() else f"there is no such {kind}"
     except (OSError, ValueError, RuntimeError) as e:
         reason = e.strerror if isinstance(e, OSError) else str(e)

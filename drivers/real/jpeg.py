@@ -6,8 +6,8 @@ import re
 import struct
 from typing import cast
 
-import cv2
 import numpy as np
+import simplejpeg
 from numpy.typing import NDArray
 
 from drivers.errors import ProtocolError
@@ -21,8 +21,8 @@ _ALIEN = re.compile(rb"\xff[\xc0-\xc3\xc5-\xcf\xd8\xd9]")
 def decoded(name: str, data: bytes, grey: bool = False) -> NDArray[np.uint8]:
     """The picture in ``data``: (h, w, 3) blue first, or (h, w) where ``grey``; never turned by what it says of itself.
 
-    Raises ProtocolError, for the device ``name``, where it is no baseline JPEG, larger than `pictures.MOST`, cut short
-    or spliced. A decoder would fill what is missing with grey.
+    Raises ProtocolError, for the device ``name``, where it is no baseline JPEG, larger than `pictures.MOST`, cut short,
+    spliced, or decodes with bytes too many or too few. Most decoders fill what is missing with grey and say nothing.
     """
     size = pictures.pixels(data) if data.startswith(b"\xff\xd8") else None
     if size is None or not 0 < size <= pictures.MOST:
@@ -34,14 +34,11 @@ def decoded(name: str, data: bytes, grey: bool = False) -> NDArray[np.uint8]:
     scan = _scan(whole)
     if scan is None or _ALIEN.search(whole, scan, len(whole) - len(_END)):
         raise _damaged(name, "a picture with a piece missing")
-    form = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
     try:
-        image = cv2.imdecode(np.frombuffer(whole, np.uint8), form | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error as error:
+        image = simplejpeg.decode_jpeg(whole, "GRAY" if grey else "BGR")
+    except ValueError as error:
         raise _damaged(name, f"a damaged picture: {error}") from error
-    if image is None or image.dtype != np.uint8 or image.ndim != (2 if grey else 3):
-        raise _damaged(name, "a damaged picture")
-    return cast("NDArray[np.uint8]", image)
+    return cast("NDArray[np.uint8]", image[..., 0] if grey else image)
 
 
 def _scan(data: bytes) -> int | None:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import DeviceFault, DeviceTimeout, DriverError, NotConnected, ProtocolError
+from drivers.real.chunked import ChunkedBody
 from drivers.real.frames import FrameSource
 from drivers.real.guarded import guarded
 from drivers.real.jpeg import decoded
@@ -53,6 +54,7 @@ class MjpegSource(FrameSource):
         )
         self._socket: socket.socket | None = None
         self._parser: MultipartParser | None = None
+        self._chunks: ChunkedBody | None = None  # where the answer comes in chunks
         self._begun = b""
 
     def _reach(self, timeout: float) -> None:
@@ -65,7 +67,9 @@ class MjpegSource(FrameSource):
             raise self._silent(timeout) from None
         except OSError as error:
             raise self._unreachable(error) from error
-        self._parser = MultipartParser(self.name, boundary(self.name, self.address, head), asked=f"read {self.address}")
+        asked = f"read {self.address}"
+        self._parser = MultipartParser(self.name, boundary(self.name, self.address, head), asked=asked)
+        self._chunks = ChunkedBody(self.name, asked) if in_chunks(self.name, self.address, head) else None
 
     def _connected(self, deadline: float) -> socket.socket:
         try:
@@ -85,7 +89,7 @@ class MjpegSource(FrameSource):
     def _request(self) -> bytes:
         url = self._url
         target = (url.path or "/") + (f"?{url.query}" if url.query else "")
-        # by 1.0 the answer comes as it is, not in chunks
+        # by 1.0 the answer should come as it is, not in chunks
         lines = [
             f"GET {target} HTTP/1.0",
             f"Host: {url.netloc.rpartition('@')[2]}",
@@ -125,9 +129,11 @@ class MjpegSource(FrameSource):
                 raise self._ended(error.strerror or str(error)) from error
             if not data:
                 raise self._ended(f"it ended{' in the middle of a picture' if parser.midway else ''}")
+        if self._chunks is not None:
+            data = self._chunks.feed(data)
         for part in parser.feed(data):
             self._offer(partial(self._picture, part), exposed_ns(part))
-        if parser.ended:
+        if parser.ended or (self._chunks is not None and self._chunks.ended):
             raise self._ended("the camera closed it")
 
     def _picture(self, part: Part) -> Callable[[bool], NDArray[np.uint8]]:
@@ -172,6 +178,28 @@ def boundary(name: str, address: str, head: bytes) -> str:
 
     Raises NotConnected for a status that is not 200, ProtocolError for what is no HTTP, or no stream of parts.
     """
+    headers = _headers(name, address, head)
+    kind, mark = headers.get_content_type(), headers.get_boundary()
+    if not kind.startswith("multipart/") or not mark:
+        said = "a single picture" if kind.startswith("image/") else f"{kind} without a boundary"
+        raise ProtocolError(name, f"connect to {address}", said, f"Name the stream itself. {_REMEDIES[404]}")
+    return mark
+
+
+def in_chunks(name: str, address: str, head: bytes) -> bool:
+    """Whether the body behind ``head`` comes in chunks. Raises ProtocolError for any other coding, NotConnected."""
+    headers = _headers(name, address, head)
+    told = (headers.get("transfer-encoding", ""), headers.get("content-encoding", ""))
+    codings = [word.strip().lower() for line in told for word in str(line).split(",") if word.strip()]
+    alien = sorted(set(codings) - {"chunked", "identity"})
+    if alien:
+        raise ProtocolError(
+            name, f"connect to {address}", f"a stream that is {', '.join(alien)[:80]}", "Turn its compression off"
+        )
+    return "chunked" in codings
+
+
+def _headers(name: str, address: str, head: bytes) -> Message:
     status = _STATUS.match(head)
     if status is None:
         raise ProtocolError(name, f"connect to {address}", f"{head[:40]!r}, which is no HTTP", _NO_STREAM)
@@ -180,14 +208,9 @@ def boundary(name: str, address: str, head: bytes) -> str:
         remedy = _REMEDIES.get(code, "The camera's own server is in trouble: restart it" if code >= 500 else _NO_STREAM)
         raise NotConnected(name, f"connect to {address}", f"HTTP {code} {reason[:80]}".rstrip(), remedy)
     try:
-        headers: Message = http.client.parse_headers(io.BytesIO(head[status.end() :]))
+        return http.client.parse_headers(io.BytesIO(head[status.end() :]))
     except http.client.HTTPException as error:
         raise ProtocolError(name, f"connect to {address}", f"a bad header: {error}", _NO_STREAM) from error
-    kind, mark = headers.get_content_type(), headers.get_boundary()
-    if not kind.startswith("multipart/") or not mark:
-        said = "a single picture" if kind.startswith("image/") else f"{kind} without a boundary"
-        raise ProtocolError(name, f"connect to {address}", said, f"Name the stream itself. {_REMEDIES[404]}")
-    return mark
 
 
 def exposed_ns(part: Part) -> int | None:

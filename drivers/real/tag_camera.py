@@ -81,8 +81,7 @@ class RealTagCameraConfig(CameraDevice, TagCameraConfig, frozen=True):
         K = np.array([[self.focal, 0.0, cx], [0.0, self.focal, cy], [0.0, 0.0, 1.0]])
         if self.X_WC is not None:
             return CameraModel(*size, K, np.array(self.distortion), np.array(self.X_WC, float))
-        looking = CameraModel.looking_at(self.position, self.look_at, self.focal, *size)
-        return CameraModel(*size, K, np.array(self.distortion), looking.X_WC)
+        return CameraModel(*size, K, np.array(self.distortion), super().model.X_WC)
 
 
 class RealTagCamera(ColourCamera[TagReading], TagCamera):

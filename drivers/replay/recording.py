@@ -83,6 +83,11 @@ class Recording:
         return self._ended
 
     @property
+    def share(self) -> float:
+        """How much of its files was read."""
+        return self._reel.share
+
+    @property
     def ending(self) -> str:
         """How its files end, once it has ended: ``complete``, or what is the matter with one."""
         return self._why or self._reel.ending

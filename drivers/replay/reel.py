@@ -33,14 +33,23 @@ class Reel:
     def __init__(self, files: tuple[Path, ...]):
         self.files = files
         self.ending = "complete"
+        self._read = 0
+        self._reader: LogReader | None = None
+
+    @property
+    def share(self) -> float:
+        """How much of the files has been read."""
+        now = 0.0 if self._reader is None else self._reader.share
+        return (self._read + now) / max(len(self.files), 1)
 
     def frames(self) -> Iterator[Frame]:
         """Every message. What a damaged file has lost is left out."""
         self.ending, part = "complete", -1
-        for file in self.files:
+        for number, file in enumerate(self.files):
+            self._read = number
             part += 1
             try:
-                reader = LogReader(file, salvage=True)
+                self._reader = reader = LogReader(file, salvage=True)
                 for frame in _sorted(reader, part):
                     part = frame.part
                     yield frame

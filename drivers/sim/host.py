@@ -253,6 +253,7 @@ class Host:
         self._truths += 1
 
     def _describe(self, _: bytes) -> Answer:
+        scene = self.world.staged()
         return Answer(
             json.dumps(
                 {
@@ -261,6 +262,7 @@ class Host:
                     "pid": os.getpid(),
                     "lockstep": self.world.lockstep,
                     "config": self.config.model_dump(mode="json"),
+                    "scene": None if scene is None else scene.model_dump(mode="json"),
                 }
             )
         )

@@ -78,8 +78,8 @@ class HostThread(hosting.StationHost):
                 target=self._serve, args=(self._bus,), name=f"host {config.name}", daemon=True
             )
             self._thread.start()
-            if not self._settled.wait(hosting.HOST_START):
-                raise NotConnected(config.name, asked, f"not ready within {hosting.HOST_START:g} s", remedy)
+            if not self._settled.wait(hosting.HOST_READY):
+                raise NotConnected(config.name, asked, f"not ready within {hosting.HOST_READY:g} s", remedy)
             if self._failure is not None:
                 raise NotConnected(config.name, asked, "it failed", remedy, children=(self._failure,))
         except BaseException:

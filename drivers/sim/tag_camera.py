@@ -172,9 +172,7 @@ class SimTagCamera(Faulty[TagReading], TagCamera):
     def __init__(self, name: str, config: TagCameraConfig, world: TagWorld):
         super().__init__(name, buffer=256)
         self._config, self._world = config, world
-        self._pinhole = CameraModel.looking_at(
-            config.position, config.look_at, config.focal, config.width, config.height
-        )
+        self._pinhole = config.model
         self._rng = np.random.default_rng(0)
         self._equip()
         self._detector: TagDetector | None = None

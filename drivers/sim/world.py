@@ -205,7 +205,7 @@ class World:
 
     def _restart(self, plant: Plant, scene: Scene) -> None:
         """``plant``, made of ``scene``, and every device as it is at first; time has been seen to."""
-        self._plant, self.scene, self._owed_ns = plant, scene, 0
+        self.scene, self._plant, self._owed_ns = scene, plant, 0
         for name, device in self.devices.items():
             if (restart := getattr(device, "restart", None)) is not None:
                 # a stream of its own per device: adding one leaves the others' noise as it was
@@ -221,6 +221,10 @@ class World:
                 own = (f"arm.{what}", number) if device is self._arm else (name, what, number)
                 begin_trial(stream(self.seed, *own))
         self.faults.begin_trial(self.seed, what, number)
+
+    def staged(self) -> Scene | None:
+        """The scene as it was asked for; None until the first reset. For any thread."""
+        return None if self._plant is None else self.scene
 
     def _plant_of(self, scene: Scene) -> Plant:
         fingers = self.profile.fingers

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
+import queue
 import threading
 import time
 from collections.abc import Mapping
@@ -17,9 +19,11 @@ from drivers.interfaces import Arm, ArmTarget, ForceTorqueSensor
 from drivers.wire import messages, topics
 from drivers.wire.codec import decode_reading
 from drivers.wire.lease import LeaseTable
-from drivers.wire.server import Answer, Desk, DeviceServer
+from drivers.wire.server import Answer, Desk, DeviceServer, Lane, Work
 from drivers.wire.streams import Sample
-from mechanics.readings import Array, PoseReading, Stamp, WrenchReading
+from mechanics.readings import Array, PoseReading, Stamp, Status, WrenchReading
+
+log = logging.getLogger(__name__)
 
 _ASKED = "command a set-point"
 _TICK = 0.05
@@ -59,15 +63,18 @@ class ArmServer(DeviceServer):
         self._table = LeaseTable(desk.lease)
         self._lock = threading.Lock()
         self._served: str | None = None  # for whom the arm's own lease is held; only the owner's thread touches it
+        self._unstopped = False  # a stop did not reach the arm yet
         self._closing = threading.Event()
+        self._said = ""  # what went wrong last while nobody asked
+        self._errands: queue.SimpleQueue[Work] = queue.SimpleQueue()
         self._watchman = threading.Thread(target=self._watch, name=f"{arm.name} lease", daemon=True)
 
     def open(self) -> None:
         """As `DeviceServer.open`, and watch over lease, commander and force."""
         super().open()
-        self.gates.restart(self.desk.now_ns())
+        self.gates.restart(self.desk.steady_ns(), wall_ns=self.desk.now_ns())
         with contextlib.suppress(DriverError):  # it has told nothing yet, and will
-            self.gates.at(self.arm.latest(0.1).pose)
+            self._at(self.arm.latest(0.1))
         self._stops.append(self.arm.listen(self._moved))
         for name, sensor in self._sensors.items():
             if isinstance(sensor, int | float):
@@ -79,7 +86,7 @@ class ArmServer(DeviceServer):
 
     def restart(self, pose: Array) -> None:
         """A simulated world was reset, with the arm at ``pose``: the gates begin anew."""
-        self.gates.restart(self.desk.now_ns(), pose)
+        self.gates.restart(self.desk.steady_ns(), pose, self.desk.now_ns())
 
     def _hear(self, source: str) -> None:
         """Listen to a witness of force on the bus."""
@@ -170,13 +177,14 @@ class ArmServer(DeviceServer):
                 self._need_lease(value.holder)
             with self.gates.counting("stopped"):
                 self._need_motion()
-            self.gates.admit(target, messages.stamp_ns(value.header.stamp), self.desk.now_ns())
+            sent_ns = messages.stamp_ns(value.header.stamp)
+            self.gates.admit(target, sent_ns, self.desk.steady_ns(), self.desk.now_ns())
             with self.gates.counting("arm"):
                 self.arm.command(target)
         except DriverError:
             self._tell()
             raise
-        self.gates.accept(target, self.desk.now_ns())
+        self.gates.accept(target, self.desk.steady_ns())
         stream = self._streams["target"]
         if stream.matched:  # the holder's full name would let others command in it
             told = replace(value, holder=nickname(value.holder))
@@ -206,13 +214,41 @@ class ArmServer(DeviceServer):
             self.desk.run(lambda: self._lose(holder), True)
 
     def _watch(self) -> None:
-        while not self._closing.wait(_TICK):
-            with self._lock:
-                lost = self._table.lapse(time.monotonic())
-            if lost is not None:
-                self.desk.run(lambda holder=lost: self._lose(holder), True)
-            if not self.desk.lockstep:  # there every reading of the pose looks, so that time decides and not luck
-                self._guard()
+        while not self._closing.is_set():
+            errand = None
+            with contextlib.suppress(queue.Empty):
+                errand = self._errands.get(timeout=_TICK)
+            try:
+                if errand is not None:
+                    errand()
+                else:
+                    self._look()
+            except Exception as error:  # an arm that cannot be reached now: the watch goes on
+                if str(error) != self._said:
+                    self._said = str(error)
+                    log.warning("%s: %s", self.arm.name, error)
+
+    def _look(self) -> None:
+        """What the watchman looks after by himself, whoever speaks."""
+        with self._lock:
+            lost = self._table.lapse(time.monotonic())
+        if lost is not None:
+            self.desk.run(lambda: self._lose(lost), True)
+        if self.desk.lockstep:  # there every reading of the pose looks, so that time decides and not luck
+            return
+        if self._unstopped:
+            self._soon(lambda: self._stop(self.gates.stopped))
+        self._guard()
+
+    def _soon(self, work: Work) -> None:
+        """Have urgent ``work`` done by the arm's owner: the watchman, where the owner is whoever brings the work.
+
+        That may be the thread of a sensor, which an arm that does not answer is neither to hold up nor to fail.
+        """
+        if isinstance(self.desk.run, Lane):
+            self._errands.put(work)
+        else:
+            self.desk.run(work, True)
 
     def _lose(self, holder: str) -> None:
         if self._served == holder:
@@ -227,8 +263,11 @@ class ArmServer(DeviceServer):
     # -- safety --------------------------------------------------------------------------------------------------
 
     def _moved(self, reading: PoseReading) -> None:
-        self.gates.at(reading.pose)
+        self._at(reading)
         self._guard()
+
+    def _at(self, reading: PoseReading) -> None:
+        self.gates.at(reading.pose if reading.stamp.status is Status.OK else None)
 
     def _felt_here(self, source: str, reading: WrenchReading) -> None:
         """A sensor of this process: its stamps come to the bus's time as those of its stream do."""
@@ -239,20 +278,24 @@ class ArmServer(DeviceServer):
         self._felt(source, reading)
 
     def _felt(self, source: str, reading: WrenchReading) -> None:
-        reason = self.gates.feel(source, reading, self.desk.now_ns())
+        reason = self.gates.feel(source, reading, self.desk.steady_ns())
         if reason:
-            self.desk.run(lambda: self._stop(reason), True)
+            self._soon(lambda: self._stop(reason))
 
     def _guard(self) -> None:
         """Do what the watchdogs ask for."""
-        match self.gates.watch(self.desk.now_ns()):
+        match self.gates.watch(self.desk.steady_ns()):
             case "hold":
-                self.desk.run(self._halt, True)
+                self._soon(self._halt)
             case "stop":
-                self.desk.run(lambda: self._stop(self.gates.stopped), True)
+                self._soon(lambda: self._stop(self.gates.stopped))
 
     def _halt(self) -> None:
-        self.arm.hold()
+        try:
+            self.arm.hold()
+        except DriverError:
+            self.gates.unheld()
+            raise
         self._tell()
 
     def _hold(self) -> None:
@@ -261,11 +304,14 @@ class ArmServer(DeviceServer):
 
     def _stop(self, reason: str) -> None:
         self.gates.stop(reason)
+        self._unstopped = True  # until the arm says otherwise; the watchman tries again
         self.arm.stop()
+        self._unstopped = False
         self._tell()
 
     def _recover(self) -> None:
         self.arm.recover()
+        self._unstopped = False
         self.gates.recover()
         self._tell()
 

@@ -148,6 +148,7 @@ class RemoteArm(RemoteSensor[PoseReading], Arm):
         self._need_connection(asked)
         if self._holder is None:
             raise CommandRefused(self.name, asked, "no lease", "Acquire the lease: `with arm.lease(name):`")
+        sequence, self._targets = self._targets, self._targets + 1  # a reply that is lost uses its number up
         self._ask(
             "command",
             messages.encode(
@@ -155,7 +156,7 @@ class RemoteArm(RemoteSensor[PoseReading], Arm):
                     messages.TARGET,
                     header=messages.header(self._station_ns(), "world"),
                     holder=self._holder,
-                    sequence=self._targets,
+                    sequence=sequence,
                     pose=_three(self.name, target.pose),
                     twist=_three(self.name, target.twist),
                     duration=float(target.duration),
@@ -163,7 +164,6 @@ class RemoteArm(RemoteSensor[PoseReading], Arm):
             ),
             asked,
         )
-        self._targets += 1
 
     def hold(self) -> None:
         """As `Arm.hold`."""

@@ -101,6 +101,28 @@ def decode_reading(
     return decoder(payload, type_name, stamp)
 
 
+def jpeg_of(payload: bytes) -> bytes | None:
+    """The JPEG in a sensor_msgs/CompressedImage as it was sent; None where the picture is another.
+
+    Raises ProtocolError.
+    """
+    data = messages.decode(payload, messages.COMPRESSED_IMAGE).data.tobytes()
+    size = pictures.pixels(data)
+    return data if data.startswith(b"\xff\xd8") and size is not None and 0 < size <= pictures.MOST else None
+
+
+def decode_target(payload: bytes) -> tuple[int, Array]:
+    """Capture time [ns] and pose (3,) of ee in W that an ArmTarget asks for. Raises ProtocolError."""
+    value = messages.decode(payload, messages.TARGET)
+    return messages.stamp_ns(value.header.stamp), value.pose.copy()
+
+
+def decode_diagnostics(payload: bytes) -> tuple[int, list[tuple[int, str]]]:
+    """Capture time [ns], and of each part its level (0 ok, 1 warning, 2 error) and message. Raises ProtocolError."""
+    value = messages.decode(payload, messages.DIAGNOSTICS)
+    return messages.stamp_ns(value.header.stamp), [(int(s.level), f"{s.name}: {s.message}") for s in value.status]
+
+
 Stamper = Callable[[int, str], Stamp]
 
 

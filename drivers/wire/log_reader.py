@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from mcap.records import Attachment, Channel, DataEnd, Footer, McapRecord, Message, Schema, Statistics
+from mcap.records import Attachment, Channel, DataEnd, Footer, Header, McapRecord, Message, Schema, Statistics
 
 from drivers.errors import ProtocolError
 from drivers.wire import log_records, messages
@@ -49,6 +49,7 @@ class Break(NamedTuple):
 
 class LogReader:
     """A log file. After an iteration ``ending`` is ``complete``, or says where and why the file broke off.
+    ``share`` is how much of it the iteration has read.
 
     With ``salvage`` it goes on behind damage, at the next chunk whose check sum is right; ``breaks`` are the stretches
     that are lost. A chunk that the file ends within is one: nothing vouches for a part of it. Raises ProtocolError for
@@ -59,6 +60,7 @@ class LogReader:
         self.path = Path(path)
         self.ending = "not read yet"
         self.breaks: list[Break] = []
+        self.share = 0.0
         self._salvage = salvage
         with self.path.open("rb") as file:
             magic = file.read(len(MAGIC))
@@ -102,6 +104,11 @@ class LogReader:
         for logged in self.messages(topics):
             if logged.type_name in _READINGS or logged.type_name in _RECORDS:
                 yield logged.topic, logged.value()
+
+    def library(self) -> str | None:
+        """The program that wrote the file; None where it breaks off before it says so. Our logs say ``extrinsic``."""
+        first = next(self.records(), None)
+        return first.library if isinstance(first, Header) else None
 
     def attachments(self) -> dict[str, bytes]:
         """The files in the log, by name."""
@@ -151,6 +158,7 @@ class LogReader:
                     return
             crc = None if crc is None else record.crc(crc)
             at = record.end
+            self.share = at / size
 
     def _behind(self, file: BinaryIO, broken: Broken, size: int) -> Iterator[McapRecord]:
         """What the end of the file says of topics; returns where reading goes on, None where nothing follows."""

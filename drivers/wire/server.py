@@ -85,9 +85,10 @@ class Lane:
 class Desk:
     """What the servers of one process share: the bus, the thread that owns the devices, the clock, the streams.
 
-    ``run(work, urgent)`` has ``work`` executed by the owner of the devices. ``shift_ns()`` is added to every capture
-    time. In ``lockstep`` time stands still while nobody asks for more. ``lease`` [s] is how long a commander may be
-    silent before it loses its arm. ``views`` are the rates of what viewers get.
+    ``run(work, urgent)`` has ``work`` executed by the owner of the devices. ``now_ns()`` is the station's time, and
+    ``steady_ns()`` that of a clock that nobody sets, for silences; by default the same. ``shift_ns()`` is added to
+    every capture time. In ``lockstep`` time stands still while nobody asks for more. ``lease`` [s] is how long a
+    commander may be silent before it loses its arm. ``views`` are the rates of what viewers get.
     """
 
     def __init__(
@@ -97,12 +98,14 @@ class Desk:
         *,
         run: Run | None = None,
         now_ns: Callable[[], int] = time.time_ns,
+        steady_ns: Callable[[], int] | None = None,
         shift_ns: Callable[[], int] = lambda: 0,
         lockstep: bool = False,
         lease: float = TIME_TO_LIVE,
         views: ViewRates = _VIEWS,
     ):
         self.bus, self.station, self.now_ns, self.shift_ns = bus, station, now_ns, shift_ns
+        self.steady_ns = steady_ns or now_ns
         self.run: Run = run or Lane()
         self.lockstep, self.lease, self.views = lockstep, lease, views
         self.publishers: list[Publisher] = []
@@ -245,6 +248,8 @@ class DeviceServer:
 
     def _verbs(self) -> None:
         device = self.device
+        if isinstance(device, Sensor):
+            self._serve("health", lambda _: self._health(device), direct=True)
         if isinstance(device, ForceTorqueSensor):
             self._serve("tare", lambda _: device.tare())
         if isinstance(device, Gripper):
@@ -256,6 +261,10 @@ class DeviceServer:
             self._serve("image", lambda _: _picture(device.image()))
         if isinstance(device, TactileSensor):
             self._serve("reference", lambda _: self._reference(device))
+
+    def _health(self, device: Sensor) -> Answer:
+        """What a view cannot tell: what was lost before it came here, or could not be read, since the device opened."""
+        return Answer(json.dumps({"gaps": device.gaps, "corrupt": device.corrupt}))
 
     def capture_if_wanted(self) -> None:
         """Take a frame if somebody listens: the stream of a camera that has no thread of its own.

@@ -24,6 +24,16 @@ def address(endpoint: str) -> SplitResult:
     return urlsplit("//" + endpoint.split("/", 1)[1])
 
 
+def listening(endpoint: str) -> bool:
+    """Whether anything accepts connections at an endpoint like ``tcp/127.0.0.1:7447``."""
+    where = address(endpoint)
+    try:
+        with socket.create_connection((where.hostname or "", where.port or 0), timeout=_LOOK):
+            return True
+    except OSError:
+        return False
+
+
 def settings_of(
     mode: Literal["peer", "client", "router"], endpoint: str, *, listen: bool, keys: tuple[Path, Path, Path] | None
 ) -> dict[str, Any]:
@@ -85,7 +95,10 @@ def open_session(
     except zenoh.ZError as error:
         got = str(error).split("at /")[0].strip()
         remedy = "Check bus.endpoint of the station file; another program may have the port"
-        if identity is not None and not listen:
+        if not listen and not listening(endpoint):
+            who = "router with `extrinsic lab router" if mode == "client" else "station with `extrinsic serve"
+            got, remedy = "nothing listens there", f"Start the {who} STATION`, or correct bus.endpoint"
+        elif identity is not None and not listen:
             # to zenoh every refusal is a time-out
             got, remedy = _refusal(endpoint, identity) or (got, remedy)
         raise NotConnected("bus", f"{'listen at' if listen else 'connect to'} {endpoint}", got, remedy) from error

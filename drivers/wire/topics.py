@@ -44,6 +44,15 @@ def view(topic: str) -> str:
     return f"{topic}/view"
 
 
+def device_and_stream(topic: str) -> tuple[str, str]:
+    """What a station's topic is of: the device, or whoever else speaks on the bus, and the stream. A view's, as well.
+
+    Of any other topic the last two words, the first empty where there is only one.
+    """
+    device, _, stream = topic.removesuffix("/view").rpartition("/")
+    return device.rpartition("/")[2], stream
+
+
 def alive(station: str, device: str) -> str:
     """The liveliness token that a device's server holds."""
     return f"{station}/{device}/alive"

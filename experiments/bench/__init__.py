@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from experiments.bench import figures
 from experiments.exit_codes import ExitCode
+from experiments.json_output import beside, put
 from experiments.progress import Progress
-from experiments.run_folder import write_json
+from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem, nearest, one_of
 
 #: columns of a table that goes to a file or a pipe
@@ -92,6 +90,17 @@ RUNS = 5
 TABLES: dict[str, Callable[[Sequence[figures.Figure]], Table]] = {"planning": _side_by_side}
 
 
+def horizons_of(text: str | None) -> tuple[int, ...] | None:
+    """Numbers of steps, as ``40,200,1000``. Raises InputError for anything else."""
+    if text is None:
+        return None
+    words = text.split(",")
+    if not all(word.strip().isdecimal() and 1 <= int(word) <= 100_000 for word in words):
+        wrong, expected = f"{text!r} are no horizons", "whole numbers of steps, such as 40,200,1000"
+        raise InputError([Problem("bench", None, "--horizons", wrong, expected)])
+    return tuple(dict.fromkeys(int(word) for word in words))
+
+
 def main(name: str, options: Options, json_file: Path | None, out: Path | None, check: bool) -> ExitCode:
     """Run a benchmark and show it; the exit code says whether every target holds, if that was asked.
 
@@ -105,20 +114,18 @@ def main(name: str, options: Options, json_file: Path | None, out: Path | None, 
             having = " or ".join(f"bench {other}" for other in HAVE[option])
             raise InputError([Problem("bench", None, f"--{option}", f"{name} has no {option}", having)])
     targets = figures.targets_of(name)
-    said = Console(stderr=True)
+    said = terminal(stderr=True)
     measured: list[figures.Figure] = []
     with Progress(said).step(f"bench {name}"):
         for figure in BENCHMARKS[name](options):
             measured.append(figure)
             said.print(f"{figure.name}: {figure.median:.3g} {figure.unit}", highlight=False, markup=False)
-    console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else FILE_WIDTH)
+    console = beside(json_file, FILE_WIDTH)
     console.print(figures.table(f"bench {name}", measured, targets))
     if name in TABLES:
         console.print(TABLES[name](measured))
     for path in (json_file, None if out is None else out / f"{name}.json"):
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_json(path, figures.as_json(name, measured, targets))
+        put(path, figures.as_json(name, measured, targets))
     short = figures.shortfalls(measured, targets) if check else []
     for line in short:
         said.print(f"short: {line}", style="red", highlight=False, markup=False, soft_wrap=True)

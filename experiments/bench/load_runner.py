@@ -19,12 +19,11 @@ from math import isclose
 from pathlib import Path
 from typing import Self
 
-from rich.console import Console
-
 from drivers.hosting import HostProcess
 from drivers.wire.clock import RemoteClock
 from experiments import runner
 from experiments.files import load
+from experiments.terminal import terminal
 
 SLEEP = struct.Struct("<ddd")
 """When a sleep began [s, monotonic], how long it was to take, how long it took [s]."""
@@ -80,7 +79,7 @@ def main() -> int:
                 _say(loop=True)
 
         time_sleeps(note)
-        return int(runner.run(resolved, Path(order["out"]), Console(stderr=True), _Told).exit_code)
+        return int(runner.run(resolved, Path(order["out"]), terminal(stderr=True), _Told).exit_code)
 
 
 if __name__ == "__main__":

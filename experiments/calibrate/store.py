@@ -194,8 +194,8 @@ def load(resolved: Resolved) -> Calibrations:
             expected = "auto, none, or a folder of calibration files"
             raise InputError([resolved.experiment_document.problem(("calibration", "source"), wrong, expected)])
         return found
-    problems, remade = list[Problem](), _remade(resolved)
-    for name in _wanted(resolved):
+    problems, remade = list[Problem](), made_by(resolved)
+    for name in wanted(resolved):
         file = folder / f"{name}.yaml"
         if not file.is_file():
             continue
@@ -214,7 +214,7 @@ def _tag_names(resolved: Resolved) -> list[str]:
     return [tag_name(resolved.grasped.name, tag.id) for tag in resolved.grasped.all_tags]
 
 
-def _wanted(resolved: Resolved) -> list[str]:
+def wanted(resolved: Resolved) -> list[str]:
     """The names of the files that this experiment has a use for."""
     objects = prints(resolved)
     return [
@@ -227,7 +227,7 @@ def _wanted(resolved: Resolved) -> list[str]:
     ]
 
 
-def _remade(resolved: Resolved) -> set[str]:
+def made_by(resolved: Resolved) -> set[str]:
     """The names of the files that this experiment's own stages write."""
     held, objects = resolved.grasped.name, prints(resolved)
     written = {

@@ -19,11 +19,12 @@ from distributed.utils import silence_logging_cmgr
 from rich.console import Console
 
 from drivers.errors import NotConnected
-from experiments.campaign.folder import CampaignFolder
+from experiments.campaign.folder import CampaignFolder, JobFolder
 from experiments.campaign.jobs import FAILED, Job, JobOutcome, examine, resolve
 from experiments.campaign.progress import Tell, progress
 from experiments.campaign.work import JobFailed, Unattended, Unsampled, work
 from experiments.interrupt import Interrupt
+from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem
 
 #: how long a scheduler may take to answer, and to have a worker [s]
@@ -60,7 +61,7 @@ def run_jobs(
     NotConnected when the scheduler goes or no worker comes; and KeyboardInterrupt. A campaign that was cut off goes on
     when it is started again.
     """
-    console = console or Console(stderr=True)
+    console = console or terminal(stderr=True)
     if not jobs:
         return []
     campaign, resolved = CampaignFolder(folder), resolve(jobs)
@@ -97,7 +98,7 @@ def _run(client: Client, jobs: Sequence[Job], campaign: CampaignFolder, retries:
             remedy = "Start the sweep again with the same --out: it goes on with what is missing"
             raise NotConnected(f"scheduler {where}", f"run {job.id}", "it has gone", remedy)
         if ended is None:
-            reason = _reason(future)
+            reason = _reason(future, folder)
             folder.give_up(reason)
             tell(f"{job.id} ({job.told}): {FAILED}: {reason}")
         else:
@@ -108,8 +109,10 @@ def _run(client: Client, jobs: Sequence[Job], campaign: CampaignFolder, retries:
         future.release()  # the scheduler may forget it
 
 
-def _reason(future: Future) -> str:
-    """Why no attempt came to an end."""
+def _reason(future: Future, folder: JobFolder) -> str:
+    """Why no attempt came to an end: as the last one's results say, or as the worker does."""
+    if (told := folder.told()) is not None:
+        return told
     error = future.exception()
     if error is None:  # the worker saw it end, and it is not to be seen from here
         return "its results are not here: do all workers share the sweep's file system?"
@@ -163,6 +166,12 @@ def _await_worker(client: Client) -> None:
     except TimeoutError:
         asked, got = "start its workers", f"none came within {_START:g} s"
         raise NotConnected("this machine", asked, got, "Ask for fewer `--workers`, or free some memory") from None
+
+
+def reach(scheduler: str) -> None:
+    """Raises InputError, within a bounded time, where ``scheduler`` does not answer or has no worker."""
+    with _remote(scheduler):
+        pass
 
 
 @contextmanager

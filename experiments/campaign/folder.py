@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, Field
 
 from experiments.calibrate import store
-from experiments.campaign.jobs import Job, digest, planned_trials
+from experiments.campaign.jobs import Job, digest, moved, planned_trials
 from experiments.files import Resolved, dump_resolved, load
 from experiments.planning.files import plan_files
 from experiments.results_file import Planned, Results, Word, read_json
@@ -22,6 +23,9 @@ from planning import plan_file
 
 #: a run with one of these has come to its end, and running it again would give the same
 ENDED = ("completed", "fell_short", "stopped", "infeasible")
+
+#: the name of a run's folder, and its number; whatever else lies beside is somebody's own
+_RUN = re.compile(r"run(?:\.([1-9][0-9]{0,8}))?")
 
 
 class JobFolder:
@@ -34,8 +38,8 @@ class JobFolder:
 
     def runs(self) -> list[Path]:
         """Its run folders, oldest first."""
-        found = [path for path in self.path.glob("run*") if path.is_dir()]
-        return sorted(found, key=lambda path: int(path.suffix[1:] or 0))
+        found = {int(match[1] or 0): path for path in self.path.glob("run*") if (match := _RUN.fullmatch(path.name))}
+        return [found[number] for number in sorted(found) if found[number].is_dir()]
 
     def next_run(self) -> Path:
         """A new run folder, made by nobody else."""
@@ -60,6 +64,11 @@ class JobFolder:
     def newest(self) -> dict[str, Any] | None:
         """The results of the newest run that has any, whole or not."""
         return next((found for run in reversed(self.runs()) if (found := _results(run)) is not None), None)
+
+    def told(self) -> str | None:
+        """Why the newest run did not come to its end, where it has ended itself and left word of it."""
+        results = _results(runs[-1]) if (runs := self.runs()) else None
+        return None if results is None or results["status"] == "running" else results["reason"] or None
 
     @property
     def failure(self) -> str | None:
@@ -122,7 +131,7 @@ class CampaignFolder:
 
         Raises InputError when the folder holds something else, or another campaign.
         """
-        asked = _described(jobs, resolved)
+        asked = {**_described(jobs, resolved), "folder": str(self.path)}
         if self.campaign.is_file():
             if wrong := _difference(self.read()["jobs"], asked["jobs"]):
                 expected = "the same sweep, or another folder for this one"
@@ -138,31 +147,41 @@ class CampaignFolder:
         """Write what is not there yet: campaign.json, and each job's experiment with what it reads frozen beside it.
 
         So the calibrations and the plan files that a campaign began with are those that it ends with, and a worker
-        needs no other folder than this one. Raises InputError when the folder cannot be written.
+        needs no other folder than this one, wherever it is moved. Raises InputError when it cannot be written.
         """
+        shelves = _shelves(resolved[job.id] for job in jobs)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            if not self.campaign.is_file():
+            begun = self.campaign.is_file()
+            there = self.read().get("folder") if begun else None
+            if not begun:
                 write_json(self.campaign, asked)
             for job in jobs:
                 folder = self.job(job.id)
                 if not folder.experiment.is_file():
                     folder.path.mkdir(parents=True, exist_ok=True)
-                    frozen = load(job.experiment, job.station, (*job.sets, *self._freeze(folder, resolved[job.id])))
+                    frozen = load(
+                        job.experiment, job.station, (*job.sets, *self._freeze(folder, resolved[job.id], shelves))
+                    )
                     write_atomic(folder.experiment, dump_resolved(frozen))
+                elif there is not None and there != str(self.path):
+                    frozen = moved(load(str(folder.experiment)), Path(there), self.path)
+                    write_atomic(folder.experiment, dump_resolved(frozen))
+            if begun and there != str(self.path):
+                write_json(self.campaign, asked)
         except OSError as error:
             wrong = f"cannot be written: {error.strerror}"
             raise InputError([Problem(str(self.path), None, "--out", wrong, "a folder you may write to")]) from None
 
-    def _freeze(self, folder: JobFolder, resolved: Resolved) -> list[str]:
+    def _freeze(self, folder: JobFolder, resolved: Resolved, shelves: Mapping[Path, str]) -> list[str]:
         """Copy what the job reads; the sets that name the copies. A job that calibrates writes to a copy of its own."""
         sets: list[str] = []
         stages = resolved.experiment.stages
         source = store.folder_of(resolved)
         if any(stage.stage.startswith("calibrate") for stage in stages):
-            sets.append(_set("calibration.source", _copied(source, folder.path / "calibrations")))
+            sets.append(_set("calibration.source", copied(source, folder.path / "calibrations")))
         elif resolved.experiment.calibration.source != "none" and source.is_dir():
-            sets.append(_set("calibration.source", _copied(source, self.path / "calibrations" / source.name)))
+            sets.append(_set("calibration.source", copied(source, self.path / "calibrations" / shelves[source])))
         elif resolved.experiment.calibration.source == "auto":
             sets.append(_set("calibration.source", "none"))  # what others calibrate meanwhile is not of this campaign
         plans = plan_files(resolved)
@@ -175,11 +194,23 @@ class CampaignFolder:
         return sets
 
 
+def _shelves(every: Iterable[Resolved]) -> dict[Path, str]:
+    """What the copy of each folder of calibrations is called: as the folder, as long as no other is called so."""
+    names: dict[Path, str] = {}
+    for source in map(store.folder_of, every):
+        number, name = 1, source.name
+        while source not in names and name in names.values():
+            number += 1
+            name = f"{source.name}-{number}"
+        names.setdefault(source, name)
+    return names
+
+
 def _set(key: str, value: object) -> str:
     return f"experiment.{key}={json.dumps(str(value))}"
 
 
-def _copied(source: Path, target: Path) -> Path:
+def copied(source: Path, target: Path) -> Path:
     """``target``, a copy of the files in ``source`` made once, at once; an empty folder where there is no source."""
     if not target.exists():
         aside = target.with_name(f".{target.name}")
@@ -202,7 +233,7 @@ def _described(jobs: Sequence[Job], resolved: Mapping[str, Resolved]) -> dict[st
                 "station": job.station,
                 "sets": list(job.sets),
                 "tags": dict(job.tags),
-                "resolved": digest(resolved[job.id]),
+                "resolved": digest(resolved[job.id], job.home),
                 "trials": planned_trials(resolved[job.id]),
             }
             for job in jobs

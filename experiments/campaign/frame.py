@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from rich.table import Table
 
 from experiments.campaign.folder import CampaignFolder, JobFolder
 from experiments.run_folder import write_json
-from experiments.statistics import rate
+from experiments.statistics import paired_over, rate
 from experiments.tables import COLUMNS
 
 TRIALS, SUMMARY = "trials.parquet", "summary.json"
+_PAIR = ".pair"
 #: what tells two methods apart within a cell of the grid
 METHOD = ("skill", "controller")
 
@@ -33,9 +35,17 @@ def trials_frame(folder: Path) -> pd.DataFrame:
     campaign = CampaignFolder(folder)
     jobs = campaign.read()["jobs"]
     rows = [row for job in jobs for row in _rows(campaign.path, campaign.job(job["id"]), job)]
+    return frame_of(rows, leading=("job", "run"))
+
+
+def frame_of(rows: Sequence[Mapping[str, Any]], leading: Sequence[str] = ()) -> pd.DataFrame:
+    """Rows of results.json as a table: their figures as ``measured.wrench_N.mean`` and so on.
+
+    Without any row it has the columns that every row has, those in ``leading`` first.
+    """
     if not rows:
-        return pd.DataFrame(columns=["job", "run", *METHOD, "trial", "status", "reason"])
-    frame = pd.json_normalize(rows, sep=".")
+        return pd.DataFrame(columns=[*leading, *METHOD, "trial", "status", "reason"])
+    frame = pd.json_normalize([dict(row) for row in rows], sep=".")
     nested = {name for name in frame if any(other.startswith(f"{name}.") for other in frame)}
     frame = frame.drop(
         columns=[name for name in nested if not frame[name].dropna().size]
@@ -69,9 +79,7 @@ def cells(folder: Path, frame: pd.DataFrame) -> list[dict[str, Any]]:
 
     A trial's figure is its mean over the waypoints that it reached. Seeds are pooled.
     """
-    named = dict.fromkeys(key for job in CampaignFolder(folder).read()["jobs"] for key in job["tags"])
-    keys = [column for key in named if (column := f"grid.{key}" if f"grid.{key}" in frame else key) in frame]
-    by = [*(key for key in keys if key != "seed"), *METHOD]
+    by = [*_cell_keys(folder, frame), *METHOD]
     found: list[dict[str, Any]] = []
     for _, group in frame.groupby(by, sort=False, dropna=False):
         cell = {key: _plain(group[key].iloc[0]) for key in by}
@@ -88,6 +96,43 @@ def cells(folder: Path, frame: pd.DataFrame) -> list[dict[str, Any]]:
             }
         )
     return found
+
+
+def comparisons(folder: Path, frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """For each cell of the grid, skill and pair of controllers: the mean of ``a`` − ``b`` in each error, and its 95 %
+    interval by Student's t, over the trials of one seed and number that both have.
+
+    Whatever two trials of one seed and number share, such as their grasp, is out of the difference.
+    """
+    keys = [*_cell_keys(folder, frame), "skill"]
+    # the same trial of the same skill comes more than once where a run has several plans of it
+    nth = frame.groupby(["job", *METHOD, "trial"], dropna=False).cumcount()
+    frame = frame.assign(**{_PAIR: list(zip(frame["job"], frame["trial"], nth, strict=True))})
+    found: list[dict[str, Any]] = []
+    for _, group in frame.groupby(keys, sort=False, dropna=False):
+        laws = dict(list(group.groupby("controller", sort=False)))
+        for b, a in combinations(laws, 2):
+            measured = {name: _difference(laws[a], laws[b], f"measured.{name}.mean") for name in COLUMNS}
+            if any(measured.values()):
+                cell = {key: _plain(group[key].iloc[0]) for key in keys}
+                skill = cell.pop("skill")
+                found.append({"cell": cell, "skill": skill, "a": a, "b": b, "measured": measured})
+    return found
+
+
+def _difference(a: pd.DataFrame, b: pd.DataFrame, column: str) -> dict[str, Any] | None:
+    if column not in a:
+        return None
+    known = [side.dropna(subset=[column]).set_index(_PAIR)[column].astype(float).to_dict() for side in (a, b)]
+    found = paired_over(known[0], known[1])
+    return None if found is None else {"mean": found.mean, "low": found.low, "high": found.high, "n": found.n}
+
+
+def _cell_keys(folder: Path, frame: pd.DataFrame) -> list[str]:
+    """The columns that tell the cells of the grid apart."""
+    named = dict.fromkeys(key for job in CampaignFolder(folder).read()["jobs"] for key in job["tags"])
+    keys = [column for key in named if (column := f"grid.{key}" if f"grid.{key}" in frame else key) in frame]
+    return [key for key in keys if key != "seed"]
 
 
 def _plain(value: Any) -> Any:
@@ -133,6 +178,36 @@ def summary_table(title: str, found: list[dict[str, Any]]) -> Table:
             style=None if cell["completed"] == cell["n"] else "yellow",
         )
     return table
+
+
+def comparison_table(found: list[dict[str, Any]]) -> Table:
+    """The differences between controllers for a terminal, those of two pairs and more."""
+    told = [one for one in found if any(figure and figure["n"] > 1 for figure in one["measured"].values())]
+    title = "Differences over pairs of trials of one seed and number, with 95 % intervals"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    keys = list(dict.fromkeys(key for one in told for key in one["cell"]))
+    skills = ["skill"] if len({one["skill"] for one in told}) > 1 else []
+    for name in (*keys, *skills, "controllers"):
+        table.add_column(escape(name), overflow="fold")
+    table.add_column("pairs", justify="right")
+    figures = [name for name in COLUMNS if any(one["measured"][name] for one in told)]
+    for name in figures:
+        table.add_column(escape(COLUMNS[name]), justify="right", no_wrap=True)
+    for one in told:
+        table.add_row(
+            *(escape(_shown(one["cell"][key])) for key in keys),
+            *(escape(_shown(one[key])) for key in skills),
+            escape(f"{one['a']} − {one['b']}"),
+            str(max(figure["n"] for figure in one["measured"].values() if figure)),
+            *(_interval(one["measured"][name]) for name in figures),
+        )
+    return table
+
+
+def _interval(figure: Mapping[str, Any] | None) -> str:
+    if figure is None or figure["low"] is None:
+        return "–"
+    return f"{figure['mean']:+.3f}\n{figure['low']:+.3f}…{figure['high']:+.3f}"
 
 
 def _shown(value: Any) -> str:

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import SequenceNode
 
-from experiments.campaign.jobs import Job, resolve
+from experiments.campaign.jobs import Job, digest, resolve
 from experiments.files import Resolved
 from experiments.schema import ExecuteStage
 from mechanics.yaml_input import InputError, Problem, read_text
@@ -31,21 +31,25 @@ def parse_grid(options: Sequence[str], sets: Sequence[str] = ()) -> Grid:
     """The values of each key, as the texts that ``--set`` takes, in the order given.
 
     Values are the items of a YAML list: what stands in brackets, braces or quotes is one value. Raises InputError, also
-    for a key that ``sets`` has already.
+    for a key that is or holds one that the grid or ``sets`` have already, and for two values that mean the same.
     """
     grid: dict[str, tuple[str, ...]] = {}
-    taken = {text.partition("=")[0].strip() for text in sets}
+    taken = _keys(sets)
     for option in options:
         key, equals, text = (part.strip() for part in option.partition("="))
         if not equals or not key:
             raise _refused("", f"{option!r} is no key with values", _GRID_FORM)
-        if key in grid or key in taken:
-            where = "--grid" if key in grid else "--set"
-            raise _refused(key, f"{where} has this key already", "each key once")
+        for other in grid:
+            if _within(key, other) or _within(other, key):
+                also = "" if other == key else f": {other}"
+                raise _refused(key, f"--grid has this key already{also}", "each key once")
+        if any(_within(other, key) for other in taken):
+            raise _refused(key, "--set has this key already", "each key once")
         values = _items(key, text)
-        twice = next((value for i, value in enumerate(values) if value in values[:i]), None)
+        meant = [_meaning(value) for value in map(_read, values)]
+        twice = next((i for i, value in enumerate(meant) if value in meant[:i]), None)
         if twice is not None:
-            raise _refused(key, f"the value {twice} stands twice", "each value once")
+            raise _refused(key, f"the value {values[twice]} stands twice", "each value once")
         grid[key] = values
     return grid
 
@@ -71,9 +75,9 @@ def sweep_jobs(
 ) -> list[Job]:
     """The jobs of a sweep: one for each combination of the grid, each seed and each trial.
 
-    Raises InputError for what does not load, naming the combination.
+    Raises InputError for what does not load, naming the combination, and for two combinations that are the same run.
     """
-    if seeds and ("seed" in grid or any(text.partition("=")[0].strip() == "seed" for text in sets)):
+    if seeds and any(_within(key, "experiment.seed") for key in (*grid, *_keys(sets))):
         raise InputError([Problem("--seeds", None, "seed", "the seed is set elsewhere, too", "one of them")])
     whole: list[Job] = []
     for i, values in enumerate(product(*grid.values())):
@@ -88,6 +92,7 @@ def sweep_jobs(
         if len(whole) > MOST_JOBS:
             raise InputError([Problem("--grid", None, "", f"more than {MOST_JOBS} runs", "a smaller grid")])
     resolved = resolve(whole)
+    _refuse_doubles(whole, resolved)
     return [
         replace(part, tags={**part.tags, "seed": resolved[job.id].experiment.seed})
         for job in whole
@@ -120,8 +125,49 @@ def split(job: Job, resolved: Resolved) -> list[Job]:
 
 def tag_of(text: str) -> Any:
     """A value for the table: what YAML reads in ``text`` where that is a figure or a word, else the text."""
-    [value] = read_text(f"value: [{text}]", "--grid").data["value"]
+    value = _read(text)
     return value if isinstance(value, int | float | str) else text
+
+
+def _read(text: str) -> Any:
+    [value] = read_text(f"value: [{text}]", "--grid").data["value"]
+    return value
+
+
+def _meaning(value: Any) -> Any:
+    """What is equal for values that mean the same: 0.2 and 0.20, 1 and 1.0; not 1 and true."""
+    match value:
+        case dict():
+            return {key: _meaning(inner) for key, inner in value.items()}
+        case list():
+            return [_meaning(inner) for inner in value]
+    return type(value) is bool, value
+
+
+def _keys(sets: Sequence[str]) -> list[str]:
+    return [text.partition("=")[0].strip() for text in sets]
+
+
+def _within(key: str, other: str) -> bool:
+    """Whether ``key`` is ``other``, or something in it; without ``experiment.`` or ``station.`` it may mean either."""
+    (file, path), (other_file, other_path) = _parted(key), _parted(other)
+    return path[: len(other_path)] == other_path and (not file or not other_file or file == other_file)
+
+
+def _parted(key: str) -> tuple[str, list[str]]:
+    """The file that a key names, or "", and its path, an index written as in every other way."""
+    path = [str(int(name)) if name.isascii() and name.isdecimal() else name for name in key.split(".")]
+    return (path[0], path[1:]) if path[0] in ("experiment", "station") and len(path) > 1 else ("", path)
+
+
+def _refuse_doubles(jobs: Sequence[Job], resolved: Mapping[str, Resolved]) -> None:
+    """Raises InputError where two combinations come to the same experiment on the same station."""
+    first: dict[str, Job] = {}
+    for job in jobs:
+        same = first.setdefault(digest(resolved[job.id]), job)
+        if same is not job:
+            wrong = f"{same.told} and {job.told} are one and the same run"
+            raise InputError([Problem("--grid", None, "", wrong, "combinations that differ")])
 
 
 def _items(key: str, text: str) -> tuple[str, ...]:

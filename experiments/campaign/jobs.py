@@ -17,13 +17,17 @@ from planning.errors import InfeasiblePlan
 
 @dataclass(frozen=True)
 class Job:
-    """One run. ``sets`` are as ``--set`` takes them; ``tags`` tell the jobs apart in the campaign's table."""
+    """One run. ``sets`` are as ``--set`` takes them; ``tags`` tell the jobs apart in the campaign's table.
+
+    What the run reads from the folder ``home`` moves with the campaign: two that differ by where it lies are the same.
+    """
 
     id: str
     experiment: str
     station: str | None = None
     sets: tuple[str, ...] = ()
     tags: Mapping[str, Any] = field(default_factory=dict)
+    home: Path | None = None
 
     @property
     def told(self) -> str:
@@ -105,9 +109,29 @@ def examine(jobs: Iterable[Job], resolved: Mapping[str, Resolved]) -> None:
         raise infeasible[0]
 
 
-def digest(resolved: Resolved) -> str:
-    """A fingerprint of everything that an experiment and its station say."""
+def digest(resolved: Resolved, home: Path | None = None) -> str:
+    """A fingerprint of everything that an experiment and its station say; paths within ``home`` as seen from there."""
+    if home is not None:
+        resolved = moved(resolved, home, Path())
     return hashlib.sha256(dump_resolved(resolved).encode()).hexdigest()
+
+
+def moved(resolved: Resolved, here: Path, there: Path) -> Resolved:
+    """The experiment with the calibrations and the plan files that it reads from ``here`` read from ``there``."""
+
+    def place(name: str) -> str:
+        return str(there / Path(name).relative_to(here)) if Path(name).is_relative_to(here) else name
+
+    experiment = resolved.experiment
+    calibration = experiment.calibration.model_copy(update={"source": place(experiment.calibration.source)})
+    stages = tuple(
+        stage.model_copy(update={"plan": place(stage.plan)})
+        if isinstance(stage, ExecuteStage) and stage.from_file
+        else stage
+        for stage in experiment.stages
+    )
+    changed = experiment.model_copy(update={"calibration": calibration, "stages": stages})
+    return replace(resolved, experiment=changed)
 
 
 def planned_trials(resolved: Resolved) -> list[dict[str, Any]]:

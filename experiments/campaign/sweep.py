@@ -11,12 +11,13 @@ from pandas import DataFrame
 from rich.console import Console
 
 from drivers.errors import NotConnected
+from experiments import disk
 from experiments.campaign import frame
 from experiments.campaign.engine import run_jobs
 from experiments.campaign.folder import CampaignFolder
 from experiments.campaign.grid import parse_grid, parse_seeds, sweep_jobs
 from experiments.exit_codes import ExitCode
-from experiments.run_folder import write_json
+from experiments.json_output import write
 
 
 def sweep(
@@ -39,6 +40,7 @@ def sweep(
     Raises InputError and InfeasiblePlan before anything is started. A sweep that is cut off leaves the table of what
     has been run: KeyboardInterrupt, NotConnected.
     """
+    disk.require_writable(json_file, "--json")
     jobs = sweep_jobs(experiment, station, sets, parse_grid(grid, sets), parse_seeds(seeds))
     name = Path(experiment).stem
     folder = out or Path("runs") / f"{name}-sweep-{datetime.now(UTC):%Y%m%dT%H%M%S.%f}"
@@ -53,8 +55,7 @@ def sweep(
         raise
     whole = all(outcome.status == "completed" for outcome in outcomes)
     code = ExitCode.DONE if whole else ExitCode.FELL_SHORT
-    _conclude(folder, code, json_file, console, said)
-    return code
+    return code if _conclude(folder, code, json_file, console, said) else ExitCode.DEVICE_FAILED
 
 
 _STATUS = {
@@ -65,20 +66,26 @@ _STATUS = {
 }
 
 
-def _conclude(folder: Path, code: ExitCode, json_file: Path | None, console: Console, said: Console) -> None:
-    """Write and show the table and the summary of what has been run."""
+def _conclude(folder: Path, code: ExitCode, json_file: Path | None, console: Console, said: Console) -> bool:
+    """Show and write the table and the summary of what has been run; whether they could be written."""
     campaign = CampaignFolder(folder)
     if not campaign.campaign.is_file():
-        return  # it was interrupted before anything was started
+        return True  # it was interrupted before anything was started
     summary, trials = _summary(campaign, code)
-    frame.save(folder, summary, trials)
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        write_json(json_file, summary)
     console.print(frame.summary_table(f"sweep of {summary['experiment']}", summary["cells"]))
+    differences = frame.comparison_table(summary["comparisons"])
+    if differences.row_count:
+        console.print(differences)
     for job in summary["failed"]:
         said.print(f"{job['id']}: {job['reason']}", style="red", highlight=False, markup=False, soft_wrap=True)
+    try:
+        frame.save(folder, summary, trials)
+        write(json_file, summary)
+    except OSError as error:
+        said.print(str(disk.not_kept(error, folder)), style="red", highlight=False, markup=False, soft_wrap=True)
+        return False
     console.print(f"trials: {folder / frame.TRIALS}", soft_wrap=True, highlight=False)
+    return True
 
 
 def _summary(campaign: CampaignFolder, code: ExitCode) -> tuple[dict[str, Any], DataFrame]:
@@ -98,5 +105,6 @@ def _summary(campaign: CampaignFolder, code: ExitCode) -> tuple[dict[str, Any], 
         "failed": failed,
         "trials": len(trials),
         "cells": frame.cells(campaign.path, trials),
+        "comparisons": frame.comparisons(campaign.path, trials),
     }
     return summary, trials

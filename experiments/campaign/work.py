@@ -30,7 +30,10 @@ _ALONE = threading.Lock()
 
 
 class JobFailed(Exception):
-    """The run did not come to its end: a device failed, or this worker cannot work. Another attempt may do better."""
+    """The run did not come to its end: a device failed, nobody has foreseen what happened, or this worker cannot work.
+
+    Another attempt may do better.
+    """
 
 
 class Unattended(WorkerPlugin):
@@ -70,7 +73,7 @@ def work(job: str, here: str) -> str:
     """Run the job in the folder ``job`` into a new run folder, with ``here`` as the current folder; the run's name.
 
     A job that has ended already is left as it is: a worker may die between its last file and its answer. Raises
-    JobFailed when a device failed, and whatever the run raises.
+    JobFailed when a device failed or an exception came that nobody has foreseen.
     """
     path = Path(job)
     if not path.is_dir() or not Path(here).is_dir():
@@ -120,7 +123,7 @@ def _run(path: Path) -> str:
         outcome = runner.run(resolved, run, Console(file=said, width=120), _host(resolved))
     if host_thread.stuck():  # it takes the processor from whatever runs here next; a new worker does not
         os.kill(os.getpid(), signal.SIGKILL)
-    if outcome.exit_code in (ExitCode.DEVICE_FAILED, ExitCode.INTERRUPTED):
+    if outcome.exit_code in (ExitCode.DEVICE_FAILED, ExitCode.FAILED, ExitCode.INTERRUPTED):
         raise JobFailed(outcome.reason)
     return run.name
 

@@ -21,7 +21,7 @@ from experiments.check_device.opening import opened
 from experiments.check_device.person import Person
 from experiments.check_device.stream import STREAM
 from experiments.exit_codes import ExitCode
-from experiments.run_folder import write_json
+from experiments.json_output import put
 from mechanics.yaml_input import InputError, Problem, nearest, one_of
 
 STEPS: dict[str, tuple[Step, ...]] = {
@@ -103,7 +103,7 @@ def check_device(
 
     Raises InputError for a step that its kind has not, or a ``json_file`` that cannot be written.
     """
-    if json_file is not None and not json_file.parent.is_dir():
+    if json_file is not None and not json_file.parent.is_dir():  # before a person has walked through all of it
         wrong, expected = f"there is no folder {json_file.parent}", "a file in a folder that is there"
         raise InputError([Problem("check-device", None, "--json", wrong, expected)])
     device = config.devices[name]
@@ -125,7 +125,7 @@ def check_device(
     console.print(Text(", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)))
     if json_file is not None:
         said = {"schema": 1, "station": config.name, "device": name, "kind": device.kind, "backend": device.backend}
-        write_json(json_file, said | {"exit_code": int(code), "steps": json.loads(json.dumps(rows))})
+        put(json_file, said | {"exit_code": int(code), "steps": json.loads(json.dumps(rows))})
     return code
 
 

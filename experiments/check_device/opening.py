@@ -17,7 +17,7 @@ from drivers.config import StationConfig
 from drivers.device_host import DeviceHost, make
 from drivers.errors import DeviceFault, NotConnected, SimulationDiverged
 from drivers.interfaces import Clock, Device
-from drivers.station import Station, listening
+from drivers.station import Station
 from drivers.wire import topics
 from drivers.wire.bus import Bus
 from drivers.wire.client import REMOTES
@@ -25,6 +25,7 @@ from drivers.wire.clock import RemoteClock, RemoteSimulation
 from drivers.wire.link import Link
 from drivers.wire.remote import RemoteSensor
 from drivers.wire.security import role_of
+from drivers.wire.session import listening
 from drivers.wire.station_bus import station_bus
 from experiments.ports import own_bus
 

@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 
 from experiments.command import Sets, StationName, commands
+from experiments.terminal import terminal
 
 if TYPE_CHECKING:
     from drivers.config import StationConfig
@@ -60,16 +61,14 @@ def init(
     config = load_station(station, sets or [])
     folder = out or lab_folder(config)
     access = init_lab(config, folder, _wanted(machine, runner, viewer), router_host or [], days)
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console = terminal(stderr=True, prose=True)
     console.print(f"{folder}: {', '.join(access.members())}; valid for {days} days")
     _warn(unserved(config, access), console)
     if config.bus.tls is None:
         host = (router_host or [config.bus.endpoint.split("/", 1)[1].rpartition(":")[0]])[0]
         port = config.bus.endpoint.rpartition(":")[2]
         console.print("\nPut this into the station file, then copy each member's folder to its machine:")
-        Console(soft_wrap=True, highlight=False).print(
-            f"bus:\n  endpoint: tls/{host}:{port}\n  tls: {{folder: {folder}}}", markup=False
-        )
+        terminal(prose=True).print(f"bus:\n  endpoint: tls/{host}:{port}\n  tls: {{folder: {folder}}}", markup=False)
 
 
 @command("extrinsic lab add lab1.yaml --runner bob")
@@ -91,7 +90,7 @@ def add(
     config = load_station(station, sets or [])
     folder = lab_folder(config)
     names = add_members(config, folder, _wanted(machine, runner, viewer), days)
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console = terminal(stderr=True, prose=True)
     for name in names:
         console.print(f"{folder / name}: copy it to its machine; valid for {days} days")
     _warn(unserved(config, read_access(config, folder)), console)
@@ -110,14 +109,14 @@ def revoke(
 
     config = load_station(station, sets or [])
     lab.revoke(config, lab.lab_folder(config), name)
-    Console(stderr=True, soft_wrap=True, highlight=False).print(f"{name} is revoked. {_RESTART}")
+    terminal(stderr=True, prose=True).print(f"{name} is revoked. {_RESTART}")
 
 
 @command("extrinsic lab renew lab1.yaml runner-alice")
 def renew(
     station: StationName,
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="Members, as runner-alice; all by default.")
+        list[str] | None, typer.Argument(metavar="NAME", help="Members, as runner-alice; all by default.")
     ] = None,
     days: Days = 365,
     sets: Sets = None,
@@ -128,7 +127,7 @@ def renew(
 
     config = load_station(station, sets or [])
     folder = lab.lab_folder(config)
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console = terminal(stderr=True, prose=True)
     for name in lab.renew(config, folder, names or [], days):
         console.print(f"{folder / name / lab.CERTIFICATE}: copy it to its machine; valid for {days} days")
 
@@ -148,7 +147,7 @@ def router(station: StationName, sets: Sets = None) -> None:
         raise InputError([Problem(station, None, "bus.tls", "a router without keys guards nothing", expected)])
     folder = lab_folder(config)
     access = read_access(config, folder)
-    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    console = terminal(stderr=True, prose=True)
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())

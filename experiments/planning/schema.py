@@ -7,10 +7,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic_core import CoreSchema
 
 from experiments import registries
 from experiments.planning.settings import model_of, optimiser_model
+from mechanics.json_schema import Schema, reference, when
 from mechanics.yaml_input import Refusal, nearest, one_of, validated
 from planning.problem import Form, Limits, LossWeights, PlanarArm
 
@@ -126,12 +128,14 @@ class PlanStage(_Model):
     """
 
     stage: Literal["plan"]
-    name: Slug
-    skill: str
-    parameters: dict[str, Any] = Field(default_factory=dict)
-    optimiser: dict[str, Any] = Field(default_factory=dict)
-    backend: Literal["fused", "torch", "cvxpylayers"] = "fused"
-    form: Literal["closed", "paper"] = "closed"
+    name: Slug = Field(description="what `execute` calls it")
+    skill: str = Field(description="what is done, and in which contact")
+    parameters: dict[str, Any] = Field(default_factory=dict, description="the skill's own")
+    optimiser: dict[str, Any] = Field(default_factory=dict, description="a name, or a mapping with its settings")
+    backend: Literal["fused", "torch", "cvxpylayers"] = Field(
+        default="fused", description="what solves the contact programs"
+    )
+    form: Literal["closed", "paper"] = Field(default="closed", description="what the variables are")
     weights: WeightsConfig = WeightsConfig()  # type: ignore[valid-type]
     limits: LimitsConfig = LimitsConfig()
     start: StartConfig = StartConfig()
@@ -146,6 +150,34 @@ class PlanStage(_Model):
             name = str(_optimiser_name(data.get("optimiser", {})))
             return optimiser_model(name) if name in registries.optimisers() else None
         return None
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> Schema:
+        """As a file has it: parameters by the skill's name, the optimiser by name or with its settings."""
+        found = handler.resolve_ref_schema(handler(core))
+        properties, skills, optimisers = found["properties"], registries.skills(), registries.optimisers()
+        properties["skill"]["enum"] = sorted(skills)
+        found["allOf"] = [
+            when({"skill": name}, {"properties": {"parameters": reference(skills[name].Parameters, handler)}})
+            for name in sorted(skills)
+        ]
+        names = {"type": "string", "enum": sorted(optimisers)}
+        settings = {name: reference(optimiser_model(name), handler) for name in names["enum"]}
+        properties["optimiser"] = {
+            **{key: properties["optimiser"][key] for key in ("title", "description")},
+            "default": DEFAULT_OPTIMISER,
+            "if": {"type": "string"},
+            "then": names,
+            "else": {
+                "type": "object",
+                "properties": {"name": {**names, "default": DEFAULT_OPTIMISER}},
+                "allOf": [
+                    *(when({"name": name}, settings[name]) for name in settings),
+                    when({"name": None}, settings[DEFAULT_OPTIMISER]),
+                ],
+            },
+        }
+        return found
 
     @model_validator(mode="before")
     @classmethod

@@ -18,6 +18,7 @@ from experiments.calibrate.samples import load_samples
 from experiments.calibrate.store import prints
 from experiments.files import Resolved, load
 from experiments.paper import beside
+from experiments.progress import Heard, unheard
 from experiments.results_file import ShownResults, read_json
 from experiments.run_folder import RunFolder
 from mechanics import se2
@@ -27,6 +28,7 @@ from mechanics.yaml_input import InputError, Problem
 from planning.plan import Plan
 
 SECOND = 1e-9
+_TELL = 1000  # messages
 
 
 @dataclass
@@ -52,15 +54,17 @@ class Logs:
     current: LoggedTrial | None = None
 
 
-def collect(folder: RunFolder) -> dict[str, Any]:
+def collect(folder: RunFolder, heard: Heard = unheard) -> dict[str, Any]:
     """The data that `experiments.report.page.render` takes, from what lies in ``folder``, torn or whole.
+
+    ``heard`` is called with the share of the logs that has been read.
 
     Raises InputError when the folder's experiment or its results cannot be read.
     """
     resolved = load(str(folder.experiment))
     results = _results(folder)
     known = results.get("calibration") or {}
-    log, files = read_logs(folder, resolved.experiment.report.playback_rate), folder.logs()
+    log, files = read_logs(folder, resolved.experiment.report.playback_rate, heard), folder.logs()
     mended = [told for told in (results.get("repair") or {"logs": []})["logs"] if told["ending"] != "complete"]
     if log.ending == "complete" and mended:
         log.ending = f"{mended[0]['ending']}; what was whole has been mended"
@@ -143,30 +147,30 @@ def _nominal(resolved: Resolved) -> list[dict[str, Any]]:
     ]
 
 
-def read_logs(folder: RunFolder, rate: float) -> Logs:
-    """One pass over the logs of a run; truth is thinned to ``rate`` [Hz] on the way.
+def read_logs(folder: RunFolder, rate: float, heard: Heard = unheard) -> Logs:
+    """One pass over the logs of a run; truth is thinned to ``rate`` [Hz] on the way. ``heard`` as in `collect`.
 
-    The last trial of a log is left out where the next log begins with it again: the run went on with it.
+    Of a trial that was run again, in the same log or in that of the run that went on, the last attempt counts.
     """
-    log = Logs()
-    for file in folder.logs():
-        log.current, begun = None, len(log.trials)
-        ending = _read(file, log, rate)
+    log, files = Logs(), folder.logs()
+    for number, file in enumerate(files):
+        log.current = None
+        ending = _read(file, log, rate, lambda share, before=number: heard((before + share) / len(files)))
         if log.ending in ("complete", "there is no log"):
             log.ending = ending
-        if 0 < begun < len(log.trials) and log.trials[begun].begin.trial == log.trials[begun - 1].begin.trial:
-            del log.trials[begun - 1]
     return log
 
 
-def _read(file: Path, log: Logs, rate: float) -> str:
+def _read(file: Path, log: Logs, rate: float, heard: Heard) -> str:
     """Add what is in one file; how it ends."""
     try:
         reader = LogReader(file)
     except ProtocolError as error:
         return error.got
     last_ns = next_truth = 0
-    for message in reader.messages():
+    for count, message in enumerate(reader.messages()):
+        if count % _TELL == 0:
+            heard(reader.share)
         log.counts[message.topic] = log.counts.get(message.topic, 0) + 1
         last_ns = max(last_ns, message.publish_ns)
         is_truth = message.topic.endswith("/world/truth")
@@ -194,6 +198,8 @@ def _file(log: Logs, value: object) -> None:
             current.end, log.current = value, None
         elif not value.status:
             log.current = LoggedTrial(value)
+            if log.trials and log.trials[-1].begin.trial == value.trial:
+                log.trials.pop()
             log.trials.append(log.current)
     elif current is None:
         return
@@ -234,7 +240,7 @@ def _waypoints(trial: LoggedTrial, start_ns: int) -> dict[str, Any]:
     contacts: list[list[dict[str, Any]]] = [[] for _ in points]
     plan = plan_of(trial)
     if plan is not None:
-        contacts = [_planned_contacts(plan, point.step) for point in points]
+        contacts = [planned_contacts(plan, point.step) for point in points]
     return {
         "t": [(point.capture_ns - start_ns) * SECOND for point in points],
         "planned": _states(point.planned for point in points),
@@ -246,15 +252,18 @@ def _waypoints(trial: LoggedTrial, start_ns: int) -> dict[str, Any]:
 
 def plan_of(trial: LoggedTrial) -> Plan | None:
     """The plan that a trial executed; None where it was torn off, or made by a version that wrote plans otherwise."""
-    if trial.end is None or not trial.end.plan:
-        return None
+    return None if trial.end is None else plan_in(trial.end)
+
+
+def plan_in(end: TrialRecord) -> Plan | None:
+    """As `plan_of`, from the record of a trial's end."""
     try:
-        return Plan.from_dict(json.loads(trial.end.plan))
+        return Plan.from_dict(json.loads(end.plan)) if end.plan else None
     except (ValueError, RecursionError):
         return None
 
 
-def _planned_contacts(plan: Plan, step: int) -> list[dict[str, Any]]:
+def planned_contacts(plan: Plan, step: int) -> list[dict[str, Any]]:
     """The planned contacts at a step, forces in W: f_n along the normal, f_t along the normal turned by −90°."""
     out = []
     for c, name in enumerate(plan.contact_names):

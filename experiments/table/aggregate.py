@@ -18,11 +18,14 @@ from experiments import statistics
 from experiments.metrics import paper_summary
 from experiments.paper import Figures, paper_figures
 from experiments.table.schema import PLANS, SUMMARIES, Comparison, Count, Panel, Single, Table
+from mechanics.yaml_input import InputError, Problem
 
 MEASURED, TRUTH = "measured", "truth"
 _COMPONENTS = ("fx_N", "fy_N", "tau_Nmm", "x_mm", "y_mm")
-#: pairs of trials are alike in these
-_PAIR = ("trajectory", "trial")
+#: how a trial may end that has come to a result, if not to its end
+_RESULTS = ("slipped", "lost_contact")
+
+Pair = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,20 @@ def picked(frame: pd.DataFrame, where: Mapping[str, Any]) -> pd.DataFrame:
 def completed(trials: pd.DataFrame) -> int:
     """How many trials were completed."""
     return int(np.count_nonzero(trials["status"].to_numpy() == "completed")) if len(trials) else 0
+
+
+def fell_short(table: Table, trials: pd.DataFrame) -> pd.DataFrame:
+    """The trials that were not completed, and are to be.
+
+    One that slips or loses its contact has had its result: it is held against the table where one of its counts of
+    completed trials picks it.
+    """
+    missing = trials.loc[trials["status"] != "completed"]
+    held = ~missing["status"].isin(_RESULTS)
+    for entry in table.counts:
+        if entry.of == "trials completed":
+            held |= missing.index.isin(picked(missing, entry.where).index)
+    return missing.loc[held]
 
 
 def combinations(frame: pd.DataFrame, tags: Sequence[str]) -> list[dict[str, Any]]:
@@ -173,27 +190,72 @@ def _cell(table: Table, data: Data, where: dict[str, Any], name: str) -> dict[st
 
 def findings(table: Table, data: Data, shown: Sequence[Mapping[str, Any]]) -> list[Finding]:
     """What comparisons, counts and single figures of the table come to; ``shown`` are its panels."""
-    found = [one for entry in table.comparisons for one in _compared(entry, data)]
+    found = [one for entry in table.comparisons for one in _compared(table, entry, data)]
     found += [_counted(entry, data, shown) for entry in table.counts]
     return found + [_single(entry, data) for entry in table.figures]
 
 
-def _compared(entry: Comparison, data: Data) -> Iterator[Finding]:
-    frame = picked(data.trials, entry.where)
-    column = f"{MEASURED}.{entry.figure}.mean"
+def refuse_doubles(table: Table, trials: pd.DataFrame) -> None:
+    """Look at what each comparison would pair of ``trials``, run or not.
+
+    Raises InputError where two trials of one side are alike in all that tells pairs apart.
+    """
+    problems = [
+        Problem(f"table {table.name}", None, f"comparisons.{i}", wrong, expected)
+        for i, entry in enumerate(table.comparisons)
+        for _, sides in _sides(entry, trials)
+        for wrong, expected in _doubled(sides, _alike_in(table, entry, sides))
+    ]
+    if problems:
+        raise InputError(dict.fromkeys(problems))
+
+
+def _sides(entry: Comparison, trials: pd.DataFrame) -> Iterator[tuple[dict[str, Any], list[pd.DataFrame]]]:
+    """For each value of ``each``, the trials of a and those of b."""
+    frame = picked(trials, entry.where)
     for each in combinations(frame, entry.each):
-        name = ", ".join([entry.name, *map(str, filter(None, each.values()))])
         here = picked(frame, each)
-        rows = [picked(here, where) for where in (entry.a, entry.b)]
-        sides = [_by_pair(side, column) for side in rows]
+        yield each, [picked(here, where) for where in (entry.a, entry.b)]
+
+
+def _alike_in(table: Table, entry: Comparison, sides: Sequence[pd.DataFrame]) -> list[str]:
+    """The tags that the two trials of a pair are alike in, and their number.
+
+    It is all tags but those that a and b are told apart by: those that either sets, and those that follow from them,
+    such as the run: of these a has no value that b has, too.
+    """
+    free = [tag for tag in table.tags if tag not in entry.a and tag not in entry.b]
+    values = [[set(_known(side, [tag])) for side in sides] for tag in free]
+    return [tag for tag, (a, b) in zip(free, values, strict=True) if a & b] + ["trial"]
+
+
+def _doubled(sides: Sequence[pd.DataFrame], alike_in: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """What is wrong, and what is expected, of each side with two trials of one pair."""
+    for side in sides:
+        pairs = _known(side, alike_in)
+        twice = next((pair for i, pair in enumerate(pairs) if pair in pairs[:i]), None)
+        if twice is not None:
+            told = ", ".join(f"{tag} {value}" for tag, value in zip(alike_in, twice, strict=True) if value is not None)
+            runs = [run for (run,), pair in zip(_known(side, ["run"]), pairs, strict=True) if pair == twice]
+            wrong = f"there are {len(runs)} trials with {told}, of {', '.join(dict.fromkeys(map(str, runs)))}"
+            yield wrong, "one: give `each` or `where` a tag that tells them apart"
+
+
+def _compared(table: Table, entry: Comparison, data: Data) -> Iterator[Finding]:
+    column = f"{MEASURED}.{entry.figure}.mean"
+    for each, rows in _sides(entry, data.trials):
+        name = ", ".join([entry.name, *map(str, filter(None, each.values()))])
+        alike_in = _alike_in(table, entry, rows)
+        sides = [_by_pair(side, alike_in, column) for side in rows]
         common = [pair for pair in sides[0] if pair in sides[1]]
         if not common:
             yield Finding(name, None, "no pair of trials has both")
             continue
         found = statistics.paired([sides[0][pair] for pair in common], [sides[1][pair] for pair in common])
         value = {"mean": found.mean, "upper": found.high, "lower": found.low}[entry.judged]
-        asked = {pair for side in rows for pair in _pairs(side)}
-        early = {pair for side in rows for pair in _pairs(side.loc[side["status"] != "completed"])}.intersection(common)
+        asked = {pair for side in rows for pair in _known(side, alike_in)}
+        ended_early = [side.loc[side["status"] != "completed"] for side in rows]
+        early = {pair for side in ended_early for pair in _known(side, alike_in)}.intersection(common)
         told = f"{found.mean:+.3f} ({_told_apart(found)}), {found.n} of {len(asked)} pairs"
         yield Finding(name, value, told + (f", {len(early)} not completed" if early else ""))
 
@@ -206,17 +268,18 @@ def _told_apart(found: statistics.Estimate) -> str:
     return f"95 % {found.low:+.3f} to {found.high:+.3f}, {verdict}"
 
 
-def _pairs(trials: pd.DataFrame) -> list[tuple[Any, ...]]:
-    """What pairs of trials are alike in, of each."""
-    return list(map(tuple, trials.loc[:, list(_PAIR)].to_numpy().tolist()))
+def _known(trials: pd.DataFrame, columns: Sequence[str]) -> list[Pair]:
+    """The values of ``columns`` of each trial; None where there is none."""
+    rows = trials.reindex(columns=list(columns)).to_numpy(dtype=object).tolist()
+    return [tuple(None if pd.isna(value) else value for value in row) for row in rows]
 
 
-def _by_pair(trials: pd.DataFrame, column: str) -> dict[tuple[Any, ...], float]:
+def _by_pair(trials: pd.DataFrame, alike_in: Sequence[str], column: str) -> dict[Pair, float]:
     """A figure by what pairs of trials are alike in."""
     if column not in trials:
         return {}
     known = trials.dropna(subset=[column])
-    return dict(zip(_pairs(known), known[column].to_numpy(float).tolist(), strict=True))
+    return dict(zip(_known(known, alike_in), known[column].to_numpy(float).tolist(), strict=True))
 
 
 def _counted(entry: Count, data: Data, shown: Sequence[Mapping[str, Any]]) -> Finding:

@@ -10,12 +10,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
+from experiments.calibrate import store
 from experiments.calibrate.store import Calibrations
 from experiments.campaign.jobs import InfeasibleJob
 from experiments.check import check
 from experiments.files import EXPERIMENTS, Resolved, load
 from experiments.planning.schema import PlanStage
 from experiments.schema import ExecuteStage
+from experiments.table.aggregate import refuse_doubles
 from experiments.table.schema import CalibrationEntry, RunEntry, Table, Trajectory
 from mechanics.yaml_input import InputError, Problem, locate, nearest, one_of, parse, read_yaml, set_key
 from planning.errors import InfeasiblePlan
@@ -147,7 +151,7 @@ def run_jobs_of(table: Table, run: RunEntry, options: Options, folder: Path | No
 
     ``folder`` has its calibration files. Raises InputError for a key or a value that the experiment does not take.
     """
-    controllers, trials = table.controllers_of(run), table.trials_of(run)
+    controllers = table.controllers_of(run)
     jobs: list[Asked] = []
     for n, trajectory in enumerate(table.trajectories_of(run)):
         sets = _sets({**table.set, **run.set}, trajectory.set, options.sets, options.seed, folder)
@@ -161,12 +165,17 @@ def run_jobs_of(table: Table, run: RunEntry, options: Options, folder: Path | No
         if not controllers:
             jobs.append(one)
             continue
-        numbers = range(n * trials, n * trials + trials)
         jobs += [
             replace(one, id=f"{one.id}-{number}", trial=number, controllers=controllers, plans_of=run.plans_of)
-            for number in list(numbers)[: options.trials]
+            for number in _numbers(table, run, n, options)
         ]
     return jobs
+
+
+def _numbers(table: Table, run: RunEntry, n: int, options: Options) -> range:
+    """The numbers of the trials of a run's n-th trajectory."""
+    trials = table.trials_of(run)
+    return range(n * trials, n * trials + trials)[: options.trials]
 
 
 def _grasp_centre(
@@ -181,20 +190,50 @@ def _grasp_centre(
 
 
 def check_first(table: Table, runs: Sequence[RunEntry], options: Options) -> None:
-    """Resolve every calibration and run, and try their tasks with nominal figures, before anything is started.
+    """Resolve every calibration and run, try their tasks with nominal figures, and see that comparisons are of pairs.
 
-    Raises InputError, and InfeasiblePlan where there is no plan.
+    All that before anything is started. Raises InputError, and InfeasiblePlan where there is no plan.
     """
+    _refuse_more_trials(table, runs, options)
+    left: dict[str | None, set[str]] = {None: set()}
     for entry in (entry for phase in calibration_phases(table, runs) for entry in phase):
         sets = _calibrating(table, entry, options, None)
         with _told_of(f"calibration {entry.name}"):
-            check(load(entry.experiment, entry.station, sets), Calibrations())
+            resolved = load(entry.experiment, entry.station, sets)
+            made = store.made_by(resolved)
+            if not made:
+                wrong = f"{entry.experiment} has no stage that calibrates"
+                raise InputError([_problem(table, "calibrations", entry.name, wrong, "`calibrate_…` stages")])
+            check(resolved, Calibrations())
+        left[entry.name] = left[entry.after] | made
+    trials: list[dict[str, Any]] = []
     for run in runs:
-        for trajectory in table.trajectories_of(run):
+        controllers = table.controllers_of(run)
+        for n, trajectory in enumerate(table.trajectories_of(run)):
             sets = _sets({**table.set, **run.set}, trajectory.set, options.sets, options.seed, None)
             with _told_of(f"run {run.name}, trajectory {trajectory.name}"):
-                resolved, _ = _resolved(table, run, trajectory, sets, table.controllers_of(run))
+                resolved, _ = _resolved(table, run, trajectory, sets, controllers)
                 check(resolved, Calibrations())
+            if run.calibration is not None and not left[run.calibration].intersection(store.wanted(resolved)):
+                wrong = f"nothing that {run.calibration} finds is of this run's sensor, objects or devices"
+                raise InputError([_problem(table, "runs", run.name, wrong, "one that is, or no `calibration`")])
+            tags = _tags(run, trajectory, resolved)
+            numbers = _numbers(table, run, n, options)
+            trials += [{**tags, "controller": name, "trial": number} for number in numbers for name in controllers]
+    refuse_doubles(table, pd.DataFrame(trials))
+
+
+def _problem(table: Table, key: str, name: str, wrong: str, expected: str) -> Problem:
+    return Problem(f"table {table.name}", None, f"{key}.{name}", wrong, expected)
+
+
+def _refuse_more_trials(table: Table, runs: Sequence[RunEntry], options: Options) -> None:
+    """``--trials`` makes a part of the table, never more than the table."""
+    most = max(table.trials_of(run) for run in runs)
+    if options.trials is not None and options.trials > most:
+        wrong = f"{options.trials} are more than there are: {most} of each trajectory"
+        expected = f"at most {most}; more are made by --set table.trials={options.trials}"
+        raise InputError([Problem(f"table {table.name}", None, "--trials", wrong, expected)])
 
 
 @contextmanager

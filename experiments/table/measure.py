@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,8 +11,8 @@ from typing import Any
 import pandas as pd
 from rich.console import Console
 
-from experiments.campaign.engine import run_jobs
-from experiments.campaign.folder import CampaignFolder
+from experiments.campaign.engine import reach, run_jobs
+from experiments.campaign.folder import CampaignFolder, copied
 from experiments.campaign.frame import trials_frame
 from experiments.campaign.jobs import Job, JobOutcome
 from experiments.check import check
@@ -26,6 +25,8 @@ from experiments.table.schema import RunEntry, Table
 from mechanics.yaml_input import InputError, Problem
 from planning.errors import InfeasiblePlan
 
+#: what a table's folder was begun for
+ASKED = "asked.json"
 #: a trial that ended so took the rest of its job with it
 _TOOK_THE_REST = ("stopped", "diverged")
 
@@ -36,6 +37,7 @@ class Engine:
 
     run: Callable[..., Sequence[JobOutcome]] = run_jobs
     frame: Callable[[Path], pd.DataFrame] = trials_frame
+    reach: Callable[[str], None] = reach
     workers: int = 2
     scheduler: str | None = None
 
@@ -55,6 +57,8 @@ def measure(table: Table, options: Options, engine: Engine, folder: Path, consol
     """
     runs = jobs.selected(table, options.runs)
     jobs.check_first(table, runs, options)
+    if engine.scheduler is not None and not (folder / ASKED).is_file():  # one that was begun may have nothing to run
+        engine.reach(engine.scheduler)
     _begin(folder, table, options)
     calibrated = _calibrate(table, options, engine, folder, console)
     done: list[tuple[Asked, pd.DataFrame]] = []
@@ -76,7 +80,7 @@ def measure(table: Table, options: Options, engine: Engine, folder: Path, consol
 
 def _begin(folder: Path, table: Table, options: Options) -> None:
     """Note what the folder is for. Raises InputError where something else lies, or nothing can be written."""
-    note = folder / "asked.json"
+    note = folder / ASKED
     asked = json.loads(json.dumps({"table": table.model_dump(mode="json"), **asdict(options)}))
 
     def refused(wrong: str, expected: str) -> InputError:
@@ -106,10 +110,16 @@ def _calibrate(table: Table, options: Options, engine: Engine, folder: Path, con
         for entry, outcome in zip(phase, _outcomes(asked, engine, place, console), strict=True):
             if outcome.status != "completed":
                 raise CalibrationFailed(entry.name, outcome.status, outcome.reason, outcome.run)
-            found[entry.name] = shelf / entry.name
-            if not found[entry.name].exists():
-                shutil.copytree(CampaignFolder(place).job(outcome.job.id).path / "calibrations", found[entry.name])
+            found[entry.name] = copied(
+                CampaignFolder(place).job(outcome.job.id).path / "calibrations", shelf / entry.name
+            )
+            if _names(found[entry.name]) == _names(found[entry.after or ""]):  # a rehearsal touches nothing, say
+                raise CalibrationFailed(entry.name, "fell_short", "it has left no calibration file", outcome.run)
     return found
+
+
+def _names(shelf: Path) -> set[str]:
+    return {file.name for file in shelf.glob("*.yaml")}
 
 
 def _run_phases(runs: Sequence[RunEntry]) -> list[list[RunEntry]]:
@@ -198,7 +208,12 @@ def _refusal(job: Asked) -> str | None:
 def _outcomes(asked: Sequence[Asked], engine: Engine, folder: Path, console: Console) -> Sequence[JobOutcome]:
     told = [
         Job(
-            job.id, job.experiment, job.station, job.all_sets, {key: job.tags.get(key) for key in ("run", "trajectory")}
+            job.id,
+            job.experiment,
+            job.station,
+            job.all_sets,
+            {key: job.tags.get(key) for key in ("run", "trajectory")},
+            home=folder.parent,  # the table's, with what was calibrated and planned for these jobs
         )
         for job in asked
     ]

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from rich.console import Console
 
+from experiments import disk
 from experiments.bench.figures import TARGETS, Target, Targets
 from experiments.exit_codes import ExitCode
+from experiments.json_output import beside, write
 from experiments.paper import tables as paper_tables
 from experiments.provenance import provenance
 from experiments.run_folder import write_atomic, write_json
@@ -21,7 +20,8 @@ from experiments.table import aggregate, jobs, render
 from experiments.table.jobs import Options
 from experiments.table.measure import CalibrationFailed, Engine, measure
 from experiments.table.schema import Table
-from mechanics.yaml_input import InputError, Problem, parse, read_yaml
+from experiments.terminal import terminal
+from mechanics.yaml_input import parse, read_yaml
 
 #: columns of a table that goes to a file or a pipe
 FILE_WIDTH = 100
@@ -35,10 +35,14 @@ def main(
     json_file: Path | None = None,
     check: bool = False,
 ) -> ExitCode:
-    """Make a table and show it. Raises InputError and InfeasiblePlan before anything is started."""
+    """Make a table and show it.
+
+    Raises InputError and InfeasiblePlan before anything is started, and DeviceFault where it cannot be kept.
+    """
+    disk.require_writable(json_file, "--json")
     table, sets = jobs.load_table(name, options.sets)
     options = Options(options.seed, options.trials, options.runs, sets)
-    said = Console(stderr=True)
+    said = terminal(stderr=True)
     folder = (out or Path("runs") / f"table_{table.name}-{datetime.now(UTC):%Y%m%dT%H%M%S.%f}").absolute()
     try:
         data = measure(table, options, engine, folder, said)
@@ -46,15 +50,23 @@ def main(
         said.print(f"[red]{error}[/]", soft_wrap=True, highlight=False)
         return ExitCode.DEVICE_FAILED if error.status in ("failed", "device_failed") else ExitCode.FELL_SHORT
     result = {**stated(table, options, data), "calibrations": believed(folder)}
-    keep(folder, result, data, json_file)
-    console = Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else FILE_WIDTH)
+    console = beside(json_file, FILE_WIDTH)
     render.show(console, result)
+    try:
+        keep(folder, result, data, json_file)
+    except OSError as error:
+        raise disk.not_kept(error, folder) from None
     console.print(f"table: {folder / 'table.md'}", soft_wrap=True, highlight=False)
     for line in result["shortfalls"] if check else []:
         said.print(f"short: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
     if any(trial["status"] in ("failed", "device_failed") for trial in result["incomplete"]):
         return ExitCode.DEVICE_FAILED
-    return ExitCode.FELL_SHORT if check and result["shortfalls"] else ExitCode.DONE
+    fell_short = len(aggregate.fell_short(table, data.trials))
+    if result["incomplete"]:
+        told = f"{len(result['incomplete'])} of {len(data.trials)} trials were not completed"
+        told += f"; {fell_short} of them had to be" if fell_short else ", which no count of the table asks for"
+        said.print(told, style="red" if fell_short else None, highlight=False, soft_wrap=True)
+    return ExitCode.FELL_SHORT if fell_short or (check and result["shortfalls"]) else ExitCode.DONE
 
 
 def stated(table: Table, options: Options, data: aggregate.Data) -> dict[str, Any]:
@@ -104,21 +116,15 @@ def _judged(found: aggregate.Finding, target: Target | None) -> dict[str, Any]:
 
 
 def keep(folder: Path, result: dict[str, Any], data: aggregate.Data, json_file: Path | None) -> None:
-    """Write table.json, table.md, trials.parquet and plans.parquet. Raises InputError where it cannot."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / "table.json", result)
-        write_atomic(folder / "table.md", render.markdown(result))
-        for name, frame in (("trials", data.trials), ("plans", data.plans)):
-            aside = folder / f".{name}.parquet"
-            _plain(frame).to_parquet(aside, index=False)
-            aside.replace(folder / f"{name}.parquet")
-        if json_file is not None:
-            json_file.parent.mkdir(parents=True, exist_ok=True)
-            write_json(json_file, result)
-    except OSError as error:
-        wrong = f"cannot be written: {error.strerror}"
-        raise InputError([Problem(str(error.filename), None, "", wrong, "a place you may write to")]) from None
+    """Write table.json, table.md, trials.parquet and plans.parquet. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "table.json", result)
+    write_atomic(folder / "table.md", render.markdown(result))
+    for name, frame in (("trials", data.trials), ("plans", data.plans)):
+        aside = folder / f".{name}.parquet"
+        _plain(frame).to_parquet(aside, index=False)
+        aside.replace(folder / f"{name}.parquet")
+    write(json_file, result)
 
 
 def _plain(frame: pd.DataFrame) -> pd.DataFrame:

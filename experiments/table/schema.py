@@ -13,6 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from experiments import registries
 from experiments.planning.schema import Slug
+from mechanics.json_schema import Offered
 from mechanics.yaml_input import Refusal, nearest, one_of
 
 #: what a figure may be: one of design §6's (of every trial), a summary of the paper's Table 3, or a plan's
@@ -33,6 +34,9 @@ HEADINGS = {**ERRORS, **SUMMARIES, **PLANS}
 
 #: tags that every trial has
 ALWAYS = ("run", "trajectory", "controller", "sensor", "mu_ground", "mu_object")
+
+#: what a table keeps of trials and plans besides their tags
+KEPT = ("job", "trial", "status", "reason", "deviation", "rho_mm", "file", "queries", *PLANS)
 
 Tag = str | float | int
 Where = dict[str, Tag | tuple[Tag, ...]]
@@ -56,6 +60,12 @@ def _known_figure(name: str) -> str:
     return name
 
 
+def _of_trials(name: str) -> str:
+    if name in HEADINGS and name not in ERRORS:
+        raise Refusal(f"a trial alone has no {name}: there are no pairs of it", one_of(ERRORS), nearest(name, ERRORS))
+    return _known_figure(name)
+
+
 def _known_controllers(names: tuple[str, ...]) -> tuple[str, ...]:
     known = registries.controllers()
     for i, name in enumerate(names):
@@ -64,9 +74,10 @@ def _known_controllers(names: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
-Figure = Annotated[str, AfterValidator(_known_figure)]
-Figures = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_known_figures)]
-Controllers = Annotated[tuple[str, ...], AfterValidator(_known_controllers)]
+Figure = Annotated[str, AfterValidator(_known_figure), Offered(lambda: HEADINGS)]
+TrialFigure = Annotated[str, AfterValidator(_of_trials), Offered(lambda: ERRORS)]
+Figures = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_known_figures), Offered(lambda: HEADINGS)]
+Controllers = Annotated[tuple[str, ...], AfterValidator(_known_controllers), Offered(registries.controllers)]
 
 
 class CalibrationEntry(_Model):
@@ -117,7 +128,10 @@ class Panel(_Model):
 
 
 class Comparison(_Model):
-    """``a`` − ``b`` in a figure, over pairs of trials alike in trajectory and number, for each value of ``each``.
+    """``a`` − ``b`` in a figure, for each value of ``each``, over pairs of trials of one number.
+
+    The trials of a pair are alike in every tag but those that ``a`` or ``b`` sets, and those that follow from them: the
+    run, where a's trials are of other runs than b's.
 
     The ``judged`` one of mean, ``upper`` and ``lower`` end of its 95 % interval is held against the target. A target of
     at most 0 is met by the upper end where a is surely not above b, and by the lower end even where nobody can tell:
@@ -125,7 +139,7 @@ class Comparison(_Model):
     """
 
     name: str = Field(min_length=1)
-    figure: Figure
+    figure: TrialFigure
     each: tuple[str, ...] = ()
     where: Where = Field(default_factory=dict)
     a: Where
@@ -180,6 +194,7 @@ class Table(_Model):
     def _names_are_known(self) -> Table:
         self._each_once_and_after("calibrations", self.calibrations, "after")
         self._each_once_and_after("runs", self.runs, "plans_of")
+        self._plans_are_there()
         known = [entry.name for entry in self.calibrations]
         for i, run in enumerate(self.runs):
             if run.calibration is not None and run.calibration not in known:
@@ -203,13 +218,36 @@ class Table(_Model):
                 raise Refusal(wrong, expected, nearest(named, before), at=(key, i, other))
             before.append(entry.name)
 
+    def _plans_are_there(self) -> None:
+        """A run whose saved plans are executed makes its own, for each trajectory."""
+        runs = {run.name: run for run in self.runs}
+        for i, run in enumerate(self.runs):
+            if run.plans_of is None:
+                continue
+            planner, at = runs[run.plans_of], ("runs", i, "plans_of")
+            planning = one_of(name for name, other in runs.items() if other.plans_of is None)
+            if planner.plans_of is not None:
+                raise Refusal(f"{planner.name} executes plans of {planner.plans_of}, it makes none", planning, at=at)
+            if not self.controllers_of(run):
+                raise Refusal("without controllers nobody executes the plans", "`controllers`", at=at)
+            made = [trajectory.name for trajectory in self.trajectories_of(planner)]
+            for trajectory in self.trajectories_of(run):
+                if trajectory.name not in made:
+                    wrong = f"{planner.name} has no trajectory {trajectory.name!r}"
+                    raise Refusal(wrong, one_of(made), nearest(trajectory.name, made), at=at)
+
     def _judged(self) -> Iterator[tuple[str, Any]]:
         for entry in (*self.comparisons, *self.counts, *self.figures):
             yield entry.name, entry
 
     @model_validator(mode="after")
     def _tags_are_given(self) -> Table:
-        given = {*ALWAYS, *(tag for run in self.runs for tag in run.tags)}
+        for i, run in enumerate(self.runs):
+            for tag in run.tags:
+                if tag in (*ALWAYS, *KEPT):
+                    wrong = f"every trial has its own {tag!r} already"
+                    raise Refusal(wrong, "another name for a tag of your own", at=("runs", i, "tags", tag))
+        given = self.tags
         for key in ("panels", "comparisons", "counts", "figures"):
             for i, entry in enumerate(getattr(self, key)):
                 for name in _tag_fields(entry):
@@ -218,6 +256,11 @@ class Table(_Model):
                             wrong = f"no run has the tag {tag!r}"
                             raise Refusal(wrong, one_of(given), nearest(tag, given), at=(key, i, name))
         return self
+
+    @property
+    def tags(self) -> tuple[str, ...]:
+        """Every tag that tells trials of this table apart, each once."""
+        return tuple(dict.fromkeys((*ALWAYS, *(tag for run in self.runs for tag in run.tags))))
 
     def controllers_of(self, run: RunEntry) -> tuple[str, ...]:
         """Its own, or the table's."""

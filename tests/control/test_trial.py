@@ -13,7 +13,7 @@ from control.observe import Observer
 from control.open_loop import OpenLoop
 from control.settings import TrialSettings
 from control.trial import Trial, Watch
-from drivers.errors import DeviceFault
+from drivers.errors import CommandRefused, DeviceFault
 from drivers.sim.world import World
 from estimation.force_torque import FreeAirLoad, WristSensor
 from experiments import setup
@@ -185,6 +185,20 @@ def test_a_stop_from_outside_ends_the_trial_as_stopped(phase):
     result = station.run()
     assert result.status == "stopped"
     assert "recover" in result.reason
+
+
+@pytest.mark.parametrize(("fails", "status"), [(DeviceFault, "device_failed"), (CommandRefused, "stopped")])
+def test_what_fails_on_the_way_out_ends_the_trial_too_and_says_what_came_before(fails, status):
+    station = Station()
+
+    def fail():
+        if station.phases[-1:] == ["retreat"]:
+            raise fails("wrist_ft", "read", "cable out")
+
+    station.tick = fail
+    result = station.run(force_limit=2.0)
+    assert result.status == status and result.device == "wrist_ft"
+    assert "exceeds the limit of 2 N; then wrist_ft: read" in result.reason
 
 
 def test_a_device_that_fails_ends_the_trial_and_is_named():

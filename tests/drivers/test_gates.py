@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.interpolate import CubicHermiteSpline
 
 from drivers.config import ArmLimits
 from drivers.errors import CommandRefused, DeviceTimeout, DriverError
@@ -113,7 +114,7 @@ def test_a_motion_that_is_too_harsh_is_refused_with_its_figure(target: ArmTarget
 
 def test_without_a_reading_of_the_arm_nothing_moves() -> None:
     gate = Gates("arm", ArmLimits())
-    with pytest.raises(CommandRefused, match="not yet told where it is"):
+    with pytest.raises(CommandRefused, match="has not told where it is"):
         gate.admit(to(), 0, 0)
 
 
@@ -131,6 +132,85 @@ def test_an_angle_is_measured_the_short_way_round() -> None:
     gate = gates(angle_deg=(-200, 200), step_deg=5)
     gate.restart(0, np.array([0, 0.2, math.radians(179)]))
     go(gate, to((0, 0.2, math.radians(-179)), duration=1))
+
+
+def cubic(start: Any, speed: Any, target: ArmTarget, at: float) -> tuple[Any, Any]:
+    """Where an arm is that follows scipy's cubic Hermite spline from (start, speed) to the target, and how fast."""
+    goal = CubicHermiteSpline([0, target.duration], [start, target.pose], [speed, target.twist])
+    return goal(at), goal(at, 1)
+
+
+def test_a_set_point_in_the_place_of_one_that_is_under_way_is_judged_from_where_the_arm_is_by_then() -> None:
+    """50 mm in a second; 10 ms later 50.1 mm in 20 ms, which is a leap of 50 mm and not a step of 0.1 mm."""
+    gate = gates(step_mm=100)
+    go(gate, to((0.05, 0.2, 0), duration=1.0))
+    with pytest.raises(CommandRefused, match=r"speed of 2\.5 m/s, the limit is 0\.25"):
+        gate.admit(to((0.0501, 0.2, 0), duration=0.02, sequence=1), 10 * MS, 10 * MS)
+    gate.admit(to((0.0501, 0.2, 0), duration=1.0, sequence=1), 10 * MS, 10 * MS)
+
+
+def test_set_points_that_pile_up_do_not_make_the_arm_fast() -> None:
+    """Each 10 mm and 60 ms further than the one before, but 10 ms apart: a metre in a second."""
+    gate, passed = gates(step_mm=100), 0
+    for k in range(20):
+        try:
+            go(gate, to((0.01 * (k + 1), 0.2, 0), duration=0.06, sequence=k), 10 * k * MS)
+        except CommandRefused:
+            break
+        passed += 1
+    assert passed < 3
+
+
+@pytest.mark.parametrize("when", [0.0, 0.01, 0.35, 0.9])
+def test_the_way_to_a_set_point_is_the_cubic_that_arms_follow(when: float) -> None:
+    gate = gates(turn_speed_deg=1e4, turn_acceleration_deg=1e5)
+    first = to((0.03, 0.21, 0.2), (0.05, -0.02, 0.1), 1.0)
+    go(gate, first)
+    pose, twist = cubic(HOME, REST, first, when)
+    assert gate._goal is not None
+    found = gate._goal.planned(round(when * S))
+    np.testing.assert_allclose(found[0], pose, atol=1e-12)
+    np.testing.assert_allclose(found[1], twist, atol=1e-12)
+    second = to((0.01, 0.2, 0.0), REST, 0.8, 1)
+    gate.accept(second, round(when * S))  # begins where the first has come to
+    there, speed = cubic(pose, twist, second, 0.4)
+    found = gate._goal.planned(round((when + 0.4) * S))
+    np.testing.assert_allclose(found[0], there, atol=1e-9)
+    np.testing.assert_allclose(found[1], speed, atol=1e-9)
+
+
+@pytest.mark.parametrize("late", [0, 5, 19])
+def test_a_commander_that_was_held_up_for_a_moment_may_make_up_for_it(late: int) -> None:
+    """Every third set-point of a motion at 0.2 m/s comes late, and the next at its own time."""
+    gate = gates(x=(-1, 1))
+    go(gate, to((0.001, 0.2, 0), (0.05, 0, 0), 0.04))
+    x, speed, now = 0.001, 0.05, 40
+    for k in range(1, 60):
+        faster = min(speed + 0.02, 0.2)
+        x, speed = x + (speed + faster) / 2 * 0.02, faster
+        sent = now + (late if k % 3 == 0 else 0)
+        go(gate, to((x, 0.2, 0), (speed, 0, 0), 0.02, k), sent * MS)
+        now += 20
+    assert gate.summary()["refused"] == {}
+
+
+def test_a_commander_that_looks_ahead_passes() -> None:
+    """Set-points 20 ms apart, each 100 ms ahead on a line at 0.1 m/s: they replace one another on the way."""
+    gate = gates(x=(-1, 1))
+    go(gate, to((0.005, 0.2, 0), (0.1, 0, 0), 0.1))
+    for k in range(1, 60):
+        go(gate, to((0.005 + 0.002 * k, 0.2, 0), (0.1, 0, 0), 0.1, k), 20 * k * MS)
+    assert gate.summary()["refused"] == {}
+
+
+@pytest.mark.parametrize("pose", [None, (math.nan, 0.2, 0.0), (0.0, math.inf, 0.0)])
+def test_where_the_arm_says_nothing_of_where_it_is_nothing_moves(pose: Any) -> None:
+    gate = gates()
+    gate.at(None if pose is None else np.array(pose))
+    with pytest.raises(CommandRefused, match="has not told where it is"):
+        gate.admit(to(), 0, 0)
+    gate.at(np.array(HOME))
+    gate.admit(to(), 0, 0)
 
 
 @given(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(0.5, 3.0), st.floats(-0.2, 0.2), st.integers(2, 40))
@@ -239,6 +319,50 @@ def test_a_tare_at_rest_is_no_lost_contact() -> None:
 # -- stop and recover ----------------------------------------------------------------------------------------------
 
 
+def test_a_set_point_that_a_stop_overtook_leads_nowhere() -> None:
+    """It passed, the stop came while it was on its way to the robot, and then it was accepted."""
+    gate = gates(stop_after=1.0)
+    late = to((0.001, 0.2, 0), (0.01, 0, 0), 0.1)
+    gate.admit(late, 0, 0)
+    gate.stop("a person")
+    gate.accept(late, 4 * MS)
+    gate.recover()
+    assert gate.watch(60 * S) == ""
+    gate.at(np.array([0.03, 0.2, 0.0]))  # where the stop left the arm
+    go(gate, to((0.031, 0.2, 0), duration=0.1, sequence=1), 60 * S)
+
+
+def test_a_saturated_sensor_stops_the_arm_again_after_a_recovery() -> None:
+    """Nobody knows whether what it no longer shows grows."""
+    gate = gates({"wrist_ft": 0.001})
+
+    def feel(start: int, status: Status) -> bool:
+        readings = [wrench(i * MS, (30, 0, 0), status=status) for i in range(start, start + 5)]
+        return "".join([gate.feel("wrist_ft", one, one.stamp.capture_ns) for one in readings]) != ""
+
+    assert feel(0, Status.SATURATED)
+    gate.stop("saturated")
+    gate.recover()
+    assert feel(10, Status.SATURATED)
+    gate.recover()
+    assert not feel(20, Status.OK)
+
+
+def test_a_clock_that_is_set_hides_no_silence() -> None:
+    """The wall's clock goes back by a minute: the commander, and the sensor, are as silent as before."""
+    gate = gates({"wrist_ft": 0.001}, hold_after=0.1)
+    wall = 1_700_000_000 * S
+    gate.restart(0, np.array(HOME), wall)
+    gate.feel("wrist_ft", wrench(wall), 0)
+    first = to((0.0001, 0.2, 0), (0.01, 0, 0), 0.02)
+    gate.admit(first, wall, 0, wall)
+    gate.accept(first, 0)
+    wall -= 60 * S
+    assert gate.watch(500 * MS) == "hold"
+    with pytest.raises(DeviceTimeout, match=r"no reading for 0\.5 s"):
+        gate.admit(to((0.0002, 0.2, 0), REST, 0.1, 1), wall + 500 * MS, 500 * MS, wall + 500 * MS)
+
+
 def test_a_stop_keeps_its_first_reason_until_it_is_recovered() -> None:
     gate = gates()
     gate.stop("a person")
@@ -286,6 +410,14 @@ def test_a_commander_that_rests_may_think_as_long_as_it_likes() -> None:
     gate = gates()
     go(gate, to((0.001, 0.2, 0), REST, 0.1))
     assert gate.watch(100 * S) == ""
+
+
+def test_an_arm_that_could_not_be_held_is_to_be_held_again() -> None:
+    gate = gates(hold_after=0.1, stop_after=1.0)
+    go(gate, to((0.0001, 0.2, 0), (0.01, 0, 0), 0.02))
+    assert gate.watch(200 * MS) == "hold"
+    gate.unheld()
+    assert gate.watch(250 * MS) == "hold"
 
 
 def test_the_next_set_point_ends_a_hold() -> None:

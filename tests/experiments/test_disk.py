@@ -50,6 +50,18 @@ def test_a_disk_with_too_little_room_is_bad_input_and_nothing_is_written(resolve
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_calibration_that_could_not_be_kept_is_bad_input_before_it_is_made(tmp_path):
+    (tmp_path / "notes.txt").write_text("a file")
+    for source in (tmp_path / "notes.txt", tmp_path / "notes.txt" / "deep"):
+        asked = load("calibrate", None, [f"calibration.source={source}"])
+        with pytest.raises(InputError, match=r"notes.txt is a file|it is a file") as caught:
+            disk.require_store(asked)
+        assert caught.value.problems[0].key == "calibration.source"
+    disk.require_store(load("calibrate", None, [f"calibration.source={tmp_path / 'new' / 'deep'}"]))
+    disk.require_store(load("grasped_static", None, [f"calibration.source={tmp_path / 'notes.txt'}"]))  # makes none
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
 def test_a_run_is_expected_to_log_more_under_a_law_that_feels(resolved):
     felt = load("grasped_static", None, ["stages.1.controllers=[closed_loop]", "stages.1.trials=8"])
     assert disk.expected(felt) == 8 * disk.FELT

@@ -12,9 +12,10 @@ import pytest
 from mcap.reader import SeekingReader
 
 from drivers.errors import DeviceFault
+from drivers.wire.log import LogWriter
 from drivers.wire.log_reader import LogReader
 from experiments.repair import repair
-from experiments.report.collect import collect
+from experiments.report.collect import collect, read_logs
 from experiments.run_folder import RunFolder
 from experiments.run_lock import RunLock
 from mechanics.records import TrialRecord
@@ -155,6 +156,31 @@ def test_of_a_run_that_went_on_every_log_is_read_in_its_order_and_no_trial_stand
     repair(run.path)
     assert [log.name for log in run.logs()] == ["log.repaired.mcap", "log.1.mcap"]
     assert [trial["name"] for trial in collect(run)["trials"]] == [row["name"] for row in finished.results["trials"]]
+
+
+def test_of_a_trial_that_was_run_again_in_one_log_the_last_attempt_counts(run, finished):
+    """As where a sensor cut the first off: what the run itself keeps is the second."""
+    name = finished.results["trials"][0]["name"]
+    with LogWriter(run.path / "log.1.mcap") as log:
+        for t_ns, status in ((0, ""), (5, "device_failed"), (10, "")):
+            log.write_record(TrialRecord(t_ns, name, "grasped_static", "open_loop", status=status))
+        log.write_record(TrialRecord(15, name, "grasped_static", "open_loop", status="completed"))
+    (run.path / "log.mcap").unlink()
+    trials = [(trial.begin.capture_ns, trial.end and trial.end.status) for trial in read_logs(run, 25.0).trials]
+    assert trials == [(10, "completed")]
+
+
+def test_a_run_whose_results_were_lost_is_repaired_and_goes_on_to_its_end(run, finished, shared_command):
+    run.results.write_text("{")
+    log = run.path / "log.mcap"
+    log.write_bytes(log.read_bytes()[: int(log.stat().st_size * 0.6)])
+    repair(run.path)
+    assert json.loads(run.results.read_text())["timing"]["execute_wall_s"] is None
+    gone_on = shared_command.finish(shared_command.start("run", "--resume", str(run.path)))
+    assert gone_on.code == 0, gone_on.err
+    ended = json.loads(run.results.read_text())
+    assert ended["status"] == "completed"
+    assert [trial["name"] for trial in ended["trials"]] == [trial["name"] for trial in finished.results["trials"]]
 
 
 def test_logs_are_counted_not_spelt(tmp_path):

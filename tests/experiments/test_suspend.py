@@ -19,14 +19,24 @@ def events(finished) -> list[str]:
     return [json.loads(line)["text"] for line in (finished.folder / "events.jsonl").read_text().splitlines()]
 
 
-def test_a_trial_that_a_sensor_cut_off_is_run_again_once_the_sensor_is_back(command):
-    silence = faults({"kind": "freeze", "device": "wrist_ft", "after": 4.0, "duration": 3.0})
+@pytest.mark.parametrize("after", [0.9, 3.0, 4.0])  # twice in the midst of a motion, which has to end meanwhile
+def test_a_trial_that_a_sensor_cut_off_is_run_again_once_the_sensor_is_back(command, after):
+    silence = faults({"kind": "freeze", "device": "wrist_ft", "after": after, "duration": 3.0})
     finished = command.run("grasped_static", *QUICK, *silence)
     assert finished.code == 0, finished.out + finished.err
     assert [trial["status"] for trial in finished.results["trials"]] == ["completed"]
     told = events(finished)
     assert any("device_failed: wrist_ft: watch over the arm" in text for text in told)
     assert any("the trial is run again" in text for text in told)
+
+
+def test_a_trial_is_run_again_though_nobody_sees_what_its_sensor_had(command):
+    # a camera has no stream in lockstep, where it is asked for its pictures
+    blip = faults({"kind": "freeze", "device": "camera", "after": 4.0, "duration": 2.0})
+    finished = command.run("grasped_static", *QUICK, *blip)
+    assert finished.code == 0, finished.out + finished.err
+    assert [trial["status"] for trial in finished.results["trials"]] == ["completed"]
+    assert any("camera is well again: the trial is run again" in text for text in events(finished))
 
 
 @pytest.mark.parametrize(

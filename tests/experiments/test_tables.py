@@ -57,6 +57,22 @@ def test_several_trials_end_with_the_mean_of_their_means_and_its_spread():
     assert "2.00 ± 1.00" in text
 
 
+def test_controllers_of_the_same_trials_end_with_their_difference_and_its_interval():
+    """Of −0.1, −0.2 and −0.3 the mean is −0.2, and half the interval 4.303 × 0.1/√3 = 0.248."""
+    levels, less = (1.0, 5.0, 9.0), (0.1, 0.2, 0.3)
+    trials = [trial("open_loop", n, level) | {"trial": n} for n, level in enumerate(levels)]
+    trials += [
+        trial("closed_loop", n, level - by) | {"trial": n}
+        for n, (level, by) in enumerate(zip(levels, less, strict=True))
+    ]
+    lines = shown(trials[:-1]).splitlines(), shown(trials).splitlines()
+    assert "closed_loop − open_loop" in "".join(lines[0])  # two pairs
+    [at] = [i for i, line in enumerate(lines[1]) if "closed_loop − open_loop" in line]
+    assert lines[1][at].split()[:6] == ["closed_loop", "−", "open_loop", "3", "pairs", "measured"]
+    assert "-0.20" in lines[1][at] and "-0.45…+0.05" in lines[1][at + 1]
+    assert "−" not in shown([trials[0], trials[3]])
+
+
 def test_an_extrinsic_object_has_a_column_where_there_is_one():
     assert "eo pose" not in shown([trial("open_loop")])
     row = trial("open_loop", skill="extrinsic_pushing") | {"extrinsic_object": "hbox"}

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 
 import cv2
 import numpy as np
 
 from drivers.errors import ProtocolError
+from drivers.real.chunked import ChunkedBody
 from drivers.real.jpeg import decoded
-from drivers.real.mjpeg import boundary, exposed_ns
+from drivers.real.mjpeg import boundary, exposed_ns, in_chunks
 from drivers.real.multipart import MultipartParser
 
 WORDS = (
@@ -43,16 +45,22 @@ def answers() -> list[bytes]:
     bare = b'HTTP/1.1 200 OK\nContent-Type: multipart/x-mixed-replace; boundary="--boundary"\nX: y\n\n'
     for picture in (third, second):
         bare += b"--boundary\nContent-Type: image/jpeg\n\n" + picture + b"\n"
-    return [b"\x04" + told, b"\x02" + told, b"\x03" + bare + b"--boundary--\r\n"]
+    head, _, body = told.partition(b"\r\n\r\n")
+    chunks = b"".join(b"%x\r\n%s\r\n" % (len(c), c) for c in (body[i : i + 300] for i in range(0, len(body), 300)))
+    chunked = head + b"\r\nTransfer-Encoding: chunked\r\n\r\n" + chunks + b"0\r\n\r\n"
+    return [b"\x04" + told, b"\x02" + told, b"\x03" + bare + b"--boundary--\r\n", b"\x03" + chunked]
 
 
 def take_answer(data: bytes) -> None:
     """As `drivers.real.mjpeg` takes it: what is damaged is left out, and the next part is looked at."""
     size, data = _PIECES[(data[0] if data else 0) % len(_PIECES)], data[1:]
-    at = max((data.find(end) + len(end) for end in (b"\r\n\r\n", b"\n\n") if end in data), default=len(data))
+    end = re.search(rb"\r?\n\r?\n", data)
+    at = len(data) if end is None else end.end()
     parser = MultipartParser("camera", boundary("camera", "http://camera", data[:at]), _LARGEST)
+    body = ChunkedBody("camera", "read") if in_chunks("camera", "http://camera", data[:at]) else None
     for begin in range(at, len(data), size):
-        for part in parser.feed(data[begin : begin + size]):
+        piece = data[begin : begin + size]
+        for part in parser.feed(piece if body is None else body.feed(piece)):
             told = exposed_ns(part)
             assert told is None or told > 0
             with suppress(ProtocolError):

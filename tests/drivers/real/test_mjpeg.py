@@ -6,13 +6,15 @@ import threading
 import time
 from contextlib import contextmanager, suppress
 
+import cv2
+import numpy as np
 import pytest
 
 from drivers.emulators.mjpeg_camera import MjpegCamera
 from drivers.errors import DeviceFault, DeviceTimeout, DriverError, NotConnected, ProtocolError
 from drivers.real import mjpeg
 from drivers.real.mjpeg import MjpegSource
-from tests.drivers.real.cameras import counting, number_of
+from tests.drivers.real.cameras import HEIGHT, WIDTH, counting, jpeg, number_of, numbered
 
 
 @pytest.fixture(autouse=True)
@@ -100,6 +102,24 @@ def test_what_a_camera_may_do_oddly_is_read_all_the_same(fault):
         camera.open(2.0)
         shown = [number_of(next_frame(camera).picture(False)) for _ in range(5)]
     assert shown == sorted(set(shown)) and shown[0] > 0
+
+
+def test_a_server_that_answers_in_chunks_is_read_to_the_last_pixel():
+    """Chunks of 4096 bytes, in the midst of pictures and headers."""
+    noise = np.random.default_rng(0).integers(0, 40, (HEIGHT, WIDTH, 3), np.uint8)
+    jpegs = [jpeg(numbered(n) + noise, 95) for n in (7, 8, 9)]
+    body = b"".join(b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" + jpeg + b"\r\n" for jpeg in (*jpegs, jpegs[-1]))
+    chunks = [body[i : i + 4096] for i in range(0, len(body), 4096)]
+    head = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=frame\r\n"
+    head += b"Transfer-Encoding: chunked\r\n\r\n"
+    with (
+        server(head, *(b"%x\r\n%s\r\n" % (len(c), c) for c in chunks)) as address,
+        source(address, rate=1000.0) as camera,
+    ):
+        camera.open(2.0)
+        pictures = [next_frame(camera).picture(False) for _ in jpegs]
+    for picture, sent in zip(pictures, jpegs, strict=True):
+        np.testing.assert_array_equal(picture, cv2.imdecode(np.frombuffer(sent, np.uint8), cv2.IMREAD_COLOR))
 
 
 def test_user_and_password_go_to_the_camera_and_into_no_message():

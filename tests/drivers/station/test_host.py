@@ -18,10 +18,11 @@ import pytest
 from drivers.config import StationConfig
 from drivers.errors import DeviceFault, DriverError, NotConnected
 from drivers.interfaces import ArmTarget
-from drivers.station import Devices, Station, listening
+from drivers.station import Devices, Station
 from drivers.wire.bus import Bus
 from drivers.wire.log_reader import LogReader
 from drivers.wire.remote import RemoteSensor
+from drivers.wire.session import listening
 
 from .cases import MASS, scene, station
 

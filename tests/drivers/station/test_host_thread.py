@@ -23,8 +23,9 @@ from drivers.sim import host_thread
 from drivers.sim.host import Inbox
 from drivers.sim.host_thread import HostThread
 from drivers.sim.world import World
-from drivers.station import Devices, Hosting, Station, listening
+from drivers.station import Devices, Hosting, Station
 from drivers.wire.log_reader import LogReader
+from drivers.wire.session import listening
 
 from .cases import scene, station
 

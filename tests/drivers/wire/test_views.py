@@ -341,4 +341,4 @@ def test_a_sensor_beside_the_arm_is_as_old_as_its_stream_says_however_the_statio
     desk = Desk(served, "lab", now_ns=lambda: 40_000_000 + shift, shift_ns=lambda: shift)
     with ArmServer(desk, FakeArm(), sensors={"wrist_ft": fake_wrench}) as server, DeviceServer(desk, fake_wrench):
         fake_wrench.push(39)  # taken at 39 ms
-        server.gates._witnessed(desk.now_ns())
+        server.gates._witnessed(desk.steady_ns(), desk.now_ns())

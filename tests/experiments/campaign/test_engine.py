@@ -19,6 +19,7 @@ from experiments.campaign.jobs import Job, resolve
 from experiments.campaign.work import _host as host_of
 from experiments.campaign.work import work
 from experiments.files import load
+from experiments.stages import STAGES
 from mechanics.yaml_input import InputError
 from planning.errors import InfeasiblePlan
 
@@ -87,6 +88,29 @@ def test_a_simulated_crash_fails_its_job_with_its_reason_and_takes_no_other_down
     rows = trials_frame(folder).set_index("job")
     assert rows["status"].to_dict() == {"before": "completed", "crash": "device_failed", "after": "completed"}
     assert "the device's server has died" in rows["reason"]["crash"]
+
+
+def test_an_exception_that_nobody_has_foreseen_is_the_reason_of_its_job(folder, monkeypatch):
+    def defect(_context, _stage):
+        raise ZeroDivisionError("by nothing")
+
+    monkeypatch.setitem(STAGES, "plan", defect)
+    trial = Job("a", "grasped_static", None, TRIAL, {"k": 1})
+    with cluster(1) as there:
+        [failed] = run_jobs([trial], folder, scheduler=there.scheduler_address, retries=1)
+    assert (failed.status, failed.attempts) == ("failed", 2)
+    assert failed.reason.startswith("ZeroDivisionError: by nothing. This is a defect")
+    [row] = trials_frame(folder)[["status", "reason"]].to_numpy().tolist()
+    assert row == ["failed", failed.reason]
+
+
+def test_a_folder_of_somebodys_own_beside_the_runs_is_no_run(folder):
+    job = prepared(folder, jobs("a")).job("a")
+    made = [job.next_run(), job.next_run()]
+    for name in ("run.bak", "run.1.old", "run.01", "running"):
+        (job.path / name).mkdir()
+    assert job.runs() == made
+    assert job.next_run().name == "run.2"
 
 
 @pytest.mark.parametrize(("clock", "host"), [("lockstep", HostThread), ("realtime", HostProcess)])

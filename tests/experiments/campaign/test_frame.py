@@ -1,5 +1,6 @@
 """The table of a campaign: a row for each trial, and figures that anybody can check by hand."""
 
+import io
 import json
 
 import pandas as pd
@@ -7,7 +8,9 @@ import pytest
 from rich.console import Console
 
 from experiments.campaign.folder import CampaignFolder
-from experiments.campaign.frame import cells, save, summary_table, trials_frame
+from experiments.campaign.frame import cells, comparison_table, comparisons, save, summary_table, trials_frame
+from experiments.campaign.sweep import _conclude
+from experiments.exit_codes import ExitCode
 from mechanics.yaml_input import InputError
 
 
@@ -121,6 +124,7 @@ def test_a_campaign_of_which_nothing_ran_has_an_empty_table(tmp_path):
     frame = trials_frame(folder)
     assert len(frame) == 0
     assert cells(folder, frame) == []
+    assert comparisons(folder, frame) == []
     save(folder, {}, frame)
 
 
@@ -130,6 +134,65 @@ def test_the_terminal_shows_every_cell(folder):
     first, second = [line.split() for line in console.export_text().splitlines() if "open_loop" in line]
     assert first == ["0.3", "open_loop", "2", "100%", "(34%–100%)", "2.000", "±", "1.000"]
     assert second == ["0.5", "open_loop", "2", "50%", "(9%–91%)", "2.000", "±", "0.000"]
+
+
+@pytest.fixture
+def pairs(tmp_path):
+    """Two cells of two seeds with two trials each: the second law is 0.1, 0.2, 0.3, 0.6 below the first."""
+    jobs = []
+    for mu, below in ((0.3, (0.1, 0.2, 0.3, 0.6)), (0.5, (0.4, None, None, None))):
+        for number, less in enumerate(below):
+            seed, trial = divmod(number, 2)
+            level = 10.0 * seed + trial  # what the trials of a pair share
+            rows = [row("open_loop", trial, "completed", level), row("closed_loop", trial, "completed", None)]
+            if less is not None:
+                rows[1] = row("closed_loop", trial, "completed", level - less)
+            jobs.append((f"{mu}-s{seed}-t{trial}", {"mu": mu, "seed": seed}, rows, [("completed", rows)]))
+    return campaign(tmp_path / "sweep", jobs)
+
+
+def test_controllers_are_compared_over_pairs_of_one_seed_and_trial(pairs):
+    first, second = comparisons(pairs, trials_frame(pairs))
+    assert (first["cell"], first["skill"], first["a"], first["b"]) == (
+        {"mu": 0.3},
+        "grasped_static",
+        "closed_loop",
+        "open_loop",
+    )
+    # the mean of −0.1, −0.2, −0.3, −0.6 is −0.3, their deviation 0.21602; Student's t for 4 is 3.1824
+    half = 3.1824 * 0.21602 / 2
+    expected = {"mean": -0.3, "low": -0.3 - half, "high": -0.3 + half, "n": 4}
+    assert first["measured"]["wrench_N"] == pytest.approx(expected, abs=1e-4)
+    assert first["measured"]["eo_pose_mm"] is None
+    assert second["measured"]["wrench_N"] == {"mean": pytest.approx(-0.4), "low": None, "high": None, "n": 1}
+
+
+def test_the_terminal_shows_the_differences_that_have_an_interval(pairs):
+    console = Console(width=100, record=True, force_terminal=False)
+    console.print(comparison_table(comparisons(pairs, trials_frame(pairs))))
+    lines = [line.split() for line in console.export_text().splitlines()]
+    [at] = [i for i, line in enumerate(lines) if "open_loop" in line]
+    assert lines[at] == ["0.3", "closed_loop", "−", "open_loop", "4", "-0.300"]
+    assert lines[at + 1] == ["-0.644…+0.044"]
+
+
+def test_a_summary_that_cannot_be_written_is_shown_and_said(pairs, tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    shown, said = (Console(width=100, record=True, file=io.StringIO()) for _ in range(2))
+    kept = _conclude(pairs, ExitCode.DONE, tmp_path / "file" / "x.json", shown, said)
+    assert not kept
+    text = shown.export_text()
+    assert "sweep of e" in text and "closed_loop − open_loop" in text
+    [line] = said.export_text().splitlines()
+    assert "write" in line and str(pairs) in line
+    assert _conclude(pairs, ExitCode.DONE, tmp_path / "x.json", shown, said)
+    [first, _] = json.loads((tmp_path / "x.json").read_text())["comparisons"]
+    assert first["measured"]["wrench_N"]["n"] == 4
+
+
+def test_one_controller_is_compared_with_nobody(folder):
+    assert comparisons(folder, trials_frame(folder)) == []
+    assert not comparison_table([]).row_count
 
 
 def test_a_folder_without_a_campaign_is_refused(tmp_path):

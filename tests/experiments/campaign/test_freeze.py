@@ -1,5 +1,6 @@
 """A campaign ends with the calibrations and plan files that it began with, whatever happens to them meanwhile."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -80,3 +81,40 @@ def test_plan_files_are_copied():
     Path(file).unlink()
     [copied] = plan_files(resolved).values()
     np.testing.assert_array_equal(copied.ee, plan.ee)
+
+
+def test_two_folders_of_one_name_are_kept_apart():
+    for place, mu in (("a", 0.41), ("b", 0.55)):
+        calibrate(mu)
+        Path(place).mkdir()
+        Path("calibrations").rename(f"{place}/calibrations")
+    folders = [next(Path(place).glob("calibrations/*")) for place in "ab"]
+    assert folders[0].name == folders[1].name
+    wanted = [Job(f.parts[0], "grasped_static", None, (f"calibration.source={f}",), {}) for f in folders]
+    campaign, resolved = CampaignFolder(Path("sweep")), resolve(wanted)
+    campaign.keep(campaign.agree(wanted, resolved), wanted, resolved)
+    assert [known_mu(load(str(campaign.job(job.id).experiment))) for job in wanted] == [0.41, 0.55]
+
+
+@pytest.mark.parametrize("leave", [True, False], ids=["copied", "moved"])
+def test_a_campaign_goes_on_in_another_place_with_what_lies_there(leave):
+    """``home`` is where what its jobs read lies, as a table's calibrations do."""
+    calibrate(0.41)
+    Path("first").mkdir()
+    Path("calibrations").rename("first/calibrations")
+
+    def begun(home):
+        source = next((home / "calibrations").iterdir()).absolute()
+        sets = (f"calibration.source={source}",)
+        job = Job("a", "grasped_static", None, sets, {}, home=home.absolute())
+        campaign, resolved = CampaignFolder(home / "runs"), resolve([job])
+        campaign.keep(campaign.agree([job], resolved), [job], resolved)
+        return load(str(campaign.job("a").experiment))
+
+    begun(Path("first"))
+    shutil.copytree("first", "second")
+    if not leave:
+        shutil.rmtree("first")
+    resolved = begun(Path("second"))
+    assert Path(resolved.experiment.calibration.source).is_relative_to(Path("second/runs").absolute())
+    assert known_mu(resolved) == 0.41

@@ -14,6 +14,7 @@ from mechanics.yaml_input import InputError, read_text
 
 words = st.text("abcdefghij_", min_size=1, max_size=6).filter(lambda word: word not in ("on", "off"))
 figures = st.floats(-1e3, 1e3, allow_nan=False).map(lambda value: round(value, 3)) | st.integers(-9, 9)
+figures = figures.filter(lambda value: isinstance(value, int) or not value.is_integer())  # 1 and 1.0 are one value
 values = st.recursive(
     words | figures | st.booleans(),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(words, inner, max_size=3),
@@ -113,6 +114,48 @@ def test_a_value_that_does_not_fit_is_refused_with_its_combination():
     assert "grasped_object=tall_bix" in problem.wrong
 
 
-def test_seeds_stand_in_one_place():
-    with pytest.raises(InputError, match="seed"):
-        sweep_jobs("grasped_static", None, ["seed=3"], {}, (0,))
+@pytest.mark.parametrize("key", ["seed", "experiment.seed"])
+def test_seeds_stand_in_one_place(key):
+    with pytest.raises(InputError, match="the seed is set elsewhere, too"):
+        sweep_jobs("grasped_static", None, [f"{key}=3"], {}, (0,))
+    with pytest.raises(InputError, match="the seed is set elsewhere, too"):
+        sweep_jobs("grasped_static", None, [], parse_grid([f"{key}=0,1"]), (0, 1))
+
+
+@pytest.mark.parametrize("values", ["0.2,0.20", "1,1.0", "[1,2],[1, 2.0]", "{a: 1},{a: 1.0}", "a,'a'"])
+def test_a_value_that_is_written_in_two_ways_stands_twice(values):
+    with pytest.raises(InputError, match="stands twice"):
+        parse_grid([f"trial.ramp={values}"])
+    assert parse_grid(["a=1,true,'1'"]) == {"a": ("1", "true", "'1'")}
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("world.profile", "station.world.profile"),
+        ("experiment.trial.ramp", "trial.ramp"),
+        ("stages.0.name", "stages.00.name"),
+        ("world", "station.world.profile"),
+    ],
+)
+def test_a_key_that_is_written_in_two_ways_is_given_twice(one, other):
+    for first, second in ((one, other), (other, one)):
+        with pytest.raises(InputError, match="--grid has this key already"):
+            parse_grid([f"{first}=lab,ideal", f"{second}=ideal,hard"])
+
+
+def test_a_set_may_give_the_whole_that_a_grid_varies_and_not_a_part_of_it():
+    assert parse_grid(["stages.0.parameters.steps=2,3"], ["stages=[]"])
+    with pytest.raises(InputError, match="--set has this key already"):
+        parse_grid(["world={profile: lab},{profile: ideal}"], ["station.world.profile=hard"])
+
+
+def test_keys_of_one_name_in_experiment_and_station_are_two():
+    assert len(parse_grid(["experiment.name=a,b", "station.name=c,d"])) == 2
+
+
+def test_two_combinations_that_are_the_same_run_are_refused():
+    with pytest.raises(
+        InputError, match=r"grasped_object=tall_box.* and grasped_object=tall_box\.yaml.* one and the same"
+    ):
+        sweep_jobs("grasped_static", None, [], parse_grid(["grasped_object=tall_box,tall_box.yaml"]), ())

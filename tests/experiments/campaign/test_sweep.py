@@ -15,8 +15,8 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from drivers.station import listening
 from drivers.wire.log_reader import LogReader
+from drivers.wire.session import listening
 from experiments import runner
 from experiments.calibrate import store
 from experiments.calibrate.models import ElasticityCalibration
@@ -101,6 +101,11 @@ class TestRefused:
         assert code == 2
         assert "tcp://127.0.0.1:9" in said
         assert "dask scheduler" in said
+
+    def test_a_summary_that_could_not_be_written(self):
+        code, said = refused("--json", "/proc/nope/x.json")
+        assert code == 2
+        assert "/proc/nope/x.json: --json: cannot be written" in said
 
     def test_workers_beside_a_scheduler(self):
         assert refused("--scheduler", "tcp://127.0.0.1:9", "--workers", "3")[0] == 2

@@ -74,6 +74,8 @@ class Made:
     campaigns: list = field(default_factory=list)
     resolved: dict = field(default_factory=dict)
     ends: dict = field(default_factory=dict)
+    status: dict = field(default_factory=dict)
+    finds_nothing: bool = False
     wrench: dict = field(default_factory=lambda: {"open_loop": 1.0, "closed_loop": 0.4})
 
     @property
@@ -94,7 +96,8 @@ class Made:
         run = place / "run"
         run.mkdir(parents=True, exist_ok=True)
         (place / "calibrations").mkdir(exist_ok=True)
-        for known in resolved.experiment.calibration.source, f"found-by-{job.id}":
+        names = (resolved.experiment.calibration.source, f"found-by-{job.id}")
+        for known in () if self.finds_nothing else names:
             (place / "calibrations" / f"{known.rpartition('/')[2]}.yaml").write_text(f"by: {job.id}\n")
         plans = []
         for stage in resolved.experiment.stages:
@@ -124,5 +127,5 @@ class Made:
             ) == "failed":  # as a campaign has the trials that a job did not get to
                 yield row(job, name, stage.first, status=self.ends[job], ran=False)
             else:
-                status = "stopped" if ended else "completed"
+                status = "stopped" if ended else self.status.get(job, "completed")
                 yield row(job, name, stage.first, self.wrench[name] + 0.01 * stage.first, status=status)

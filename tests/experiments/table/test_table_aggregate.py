@@ -8,6 +8,7 @@ from experiments.table import aggregate
 from experiments.table.aggregate import Data
 from experiments.table.jobs import load_table
 from experiments.table.schema import Comparison, Count, Single
+from mechanics.yaml_input import InputError
 from tests.experiments.table.table_cases import row
 
 #: Student's t, two-sided 95 %, for 3 trials
@@ -34,6 +35,10 @@ def figure(data, where, name, witness):
 
 def data(*rows):
     return Data(pd.DataFrame([one for some in rows for one in some]), pd.DataFrame())
+
+
+def compared(entry, data, table="grasped"):
+    return list(aggregate._compared(load_table(table)[0], entry, data))
 
 
 def test_a_cell_is_the_mean_over_all_waypoints_with_their_deviation():
@@ -107,12 +112,49 @@ def test_a_comparison_is_over_pairs_alike_in_trajectory_and_trial():
     ours = trials("mpc", WAYPOINTS - [[0.05], [0.1], [0.15]])[:3]
     entry = Comparison(name="ours − theirs", figure="wrench_N", a={"controller": "mpc"}, b={"controller": "open_loop"})
     alone = trials("mpc", np.full((5, 4), 9.0))[4:]  # a trial that the other has not
-    (found,) = aggregate._compared(entry, data(trials(), ours, alone))
+    (found,) = compared(entry, data(trials(), ours, alone))
     half = T_2 * 0.05 / np.sqrt(3)
     assert found.value == pytest.approx(-0.1 + half, abs=1e-3 * half)
     assert "-0.100" in found.told and found.told.endswith("3 of 4 pairs")
-    (mean,) = aggregate._compared(entry.model_copy(update={"judged": "mean"}), data(trials(), ours))
+    (mean,) = compared(entry.model_copy(update={"judged": "mean"}), data(trials(), ours))
     assert mean.value == pytest.approx(-0.1)
+
+
+def test_pairs_of_several_runs_are_all_compared():
+    """Of each run the difference is +0.20 on the mean; the n-th trials of two runs are no pair."""
+    offsets, rows = np.array([-0.1, 0.0, 0.1, 0.2, 0.2, 0.3, 0.4, 0.5]), []
+    for level, run in ((1.0, "static"), (2.0, "pivoting"), (5.0, "sliding")):
+        for controller, wrench in (("mpc", level + offsets), ("closed_loop_pi", np.full(8, level))):
+            rows += [one | {"run": run} for one in trials(controller, wrench[:, None])]
+    entry = Comparison(name="d", figure="wrench_N", a={"controller": "mpc"}, b={"controller": "closed_loop_pi"})
+    (found,) = compared(entry, data(rows))
+    half = 2.069 * np.tile(offsets, 3).std(ddof=1) / np.sqrt(24)  # Student's t for 24 differences
+    assert found.value == pytest.approx(0.2 + half, abs=1e-3 * half)
+    assert "+0.200" in found.told and "surely above" in found.told and found.told.endswith("24 of 24 pairs")
+
+
+def test_what_follows_from_a_and_b_need_not_be_alike():
+    """Two optimisers are two runs, and which run it is follows; the sensor does not, and is alike in a pair."""
+    rows = []
+    for sensor, level in (("soft_bubble", 0.0), ("gelslim", 7.0)):
+        for optimiser, more in (("grad_100", 0.0), ("lm", 0.25)):
+            told = {"optimiser": optimiser, "sensor": sensor, "mu_object": None}
+            rows += [one | {"run": f"{optimiser}_{sensor}"} for one in trials(values=WAYPOINTS + level + more, **told)]
+    entry = Comparison(name="d", figure="wrench_N", a={"optimiser": "lm"}, b={"optimiser": "grad_100"}, judged="mean")
+    (found,) = compared(entry, data(rows), "optimizers")
+    assert found.value == pytest.approx(0.25)
+    assert found.told.endswith("6 of 6 pairs")
+
+
+def test_two_trials_of_one_pair_are_refused_with_the_comparison():
+    rows = [
+        one | {"run": run} for run, law in zip("abc", ("mpc", "mpc", "open_loop"), strict=True) for one in trials(law)
+    ]
+    entry = Comparison(name="d", figure="wrench_N", a={"controller": "mpc"}, b={"controller": "open_loop"})
+    table = load_table("grasped")[0].model_copy(update={"comparisons": (entry,)})
+    with pytest.raises(InputError, match=r"comparisons\.0: there are 2 trials with trajectory a, trial 0, of a, b"):
+        aggregate.refuse_doubles(table, data(rows).trials)
+    aggregate.refuse_doubles(table, data(rows[3:]).trials)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +168,7 @@ def test_a_comparison_is_over_pairs_alike_in_trajectory_and_trial():
 def test_a_comparison_prints_both_ends_and_what_they_say(shift, verdict):
     ours = trials("mpc", WAYPOINTS + np.array(shift)[:, None])
     entry = Comparison(name="d", figure="wrench_N", a={"controller": "mpc"}, b={"controller": "open_loop"})
-    (found,) = aggregate._compared(entry, data(trials(), ours))
+    (found,) = compared(entry, data(trials(), ours))
     assert verdict in found.told
     assert found.value is not None and (found.value <= 0) == verdict.endswith("below")
 
@@ -135,13 +177,13 @@ def test_a_comparison_says_how_many_of_its_pairs_ended_early():
     ours = trials("mpc")
     ours[1]["status"] = "slipped"
     entry = Comparison(name="d", figure="wrench_N", a={"controller": "mpc"}, b={"controller": "open_loop"})
-    (found,) = aggregate._compared(entry, data(trials(), ours))
+    (found,) = compared(entry, data(trials(), ours))
     assert found.told.endswith("3 of 3 pairs, 1 not completed")
 
 
 def test_a_comparison_without_pairs_says_so():
     entry = Comparison(name="x", figure="wrench_N", a={"controller": "mpc"}, b={"controller": "open_loop"})
-    (found,) = aggregate._compared(entry, data(trials()))
+    (found,) = compared(entry, data(trials()))
     assert (found.value, found.told) == (None, "no pair of trials has both")
 
 

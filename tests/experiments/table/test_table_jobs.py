@@ -2,10 +2,12 @@
 
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from experiments.files import load
-from experiments.table import jobs
+from experiments.table import aggregate, jobs
+from experiments.table.aggregate import Data
 from experiments.table.jobs import Options
 from mechanics.yaml_input import InputError
 from planning.errors import InfeasiblePlan
@@ -92,6 +94,22 @@ def test_calibrations_come_in_the_order_in_which_they_need_each_other(table):
     assert jobs.calibration_phases(table, [run for run in table.runs if run.calibration is None]) == []
 
 
+@pytest.mark.parametrize(("name", "pairs"), [("grasped", 8), ("extrinsic", 3), ("pivoting", 3), ("optimizers", 5)])
+def test_the_papers_comparisons_have_a_pair_for_each_trial_of_a_run(name, pairs):
+    """8 grasps of a skill; 3 trajectories of a skill or shape; 5 optimisations of an optimiser, on each sensor."""
+    table = jobs.load_table(name)[0]
+    asked = [job for run in table.runs for job in jobs.run_jobs_of(table, run, Options(), None)]
+    rows = [
+        {**job.tags, "controller": law, "trial": job.trial, "status": "completed"}
+        for job in asked
+        for law in job.controllers
+    ]
+    trials = pd.DataFrame(rows).assign(**{f"measured.{name}.mean": 0.5 for name in ("wrench_N", "eo_pose_mm")})
+    aggregate.refuse_doubles(table, trials)
+    found = [one for entry in table.comparisons for one in aggregate._compared(table, entry, Data(trials, trials))]
+    assert found and {one.told.rpartition(", ")[2] for one in found} == {f"{pairs} of {pairs} pairs"}
+
+
 def test_the_run_whose_plans_are_executed_runs_too():
     table = jobs.load_table("optimizers")[0]
     assert [run.name for run in jobs.selected(table, ["lm_gelslim"])] == ["lm", "lm_gelslim"]
@@ -109,6 +127,32 @@ def test_a_key_that_does_not_exist_is_refused_with_run_and_trajectory(small):
         InputError, match=r"run slow, trajectory b: --set stages.0.parameters.angel_deg.*\n.*\n.*angle_deg"
     ):
         jobs.check_first(table, table.runs, Options())
+
+
+def test_a_calibration_that_does_not_calibrate_is_refused(small):
+    small.write_text(SMALL.replace("name: hand\n", "name: hand\n    experiment: grasped_static\n", 1).replace(
+        "    set: {stages: [{stage: calibrate_clock}]}\n", "", 1
+    ))  # fmt: skip
+    table = jobs.load_table(str(small))[0]
+    with pytest.raises(InputError, match=r"calibrations\.hand: grasped_static has no stage that calibrates"):
+        jobs.check_first(table, table.runs, Options())
+
+
+def test_a_run_that_can_use_nothing_of_its_calibration_is_refused(small):
+    """The friction of one object tells nothing of another's."""
+    small.write_text(
+        SMALL.replace("{stage: calibrate_clock}", "{stage: calibrate_friction, pair: go-eo}")
+        .replace("pair: go-ground}]}", "pair: eo-ground}]}")
+        .replace("tags: {skill: static}\n", "tags: {skill: static}\n    set: {extrinsic_object: pentagon}\n", 1)
+    )
+    table = jobs.load_table(str(small))[0]
+    with pytest.raises(InputError, match=r"runs\.static: nothing that rough finds is of this run's"):
+        jobs.check_first(table, table.runs, Options())
+
+
+def test_more_trials_than_the_table_has_are_refused_with_what_makes_more(table):
+    with pytest.raises(InputError, match=r"--trials: 3 are more .*: 2 of each(.|\n)*--set table\.trials=3"):
+        jobs.check_first(table, table.runs, Options(trials=3))
 
 
 def test_a_task_without_a_plan_is_refused_with_run_and_trajectory(small):

@@ -1,10 +1,15 @@
 """The whole way of a table with an engine that makes its trials up: order, calibrations, files, exit codes."""
 
+import errno
 import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
+from drivers.errors import DeviceFault
 from experiments.exit_codes import ExitCode
 from experiments.table import jobs
 from experiments.table.jobs import Options
@@ -33,6 +38,7 @@ def test_calibrations_run_first_and_each_run_believes_its_own(made, small, out):
     assert sources["calibration-rough"] == str(shelf / "hand")
     assert sources["static-a-0"] == str(shelf / "rough")
     assert sources["slow-a-0"] == str(shelf / "none")  # it names none
+    assert {job.home for _, campaign in made.campaigns for job in campaign} == {out}  # a table may be moved
     assert "found-by-calibration-rough.yaml" in {file.name for file in (shelf / "rough").iterdir()}
 
 
@@ -85,6 +91,34 @@ def test_a_calibration_without_an_answer_ends_the_table(made, small, out, capsys
     assert "calibration rough: fell_short: why" in capsys.readouterr().err
 
 
+def test_calibrations_are_taken_whole_or_not_at_all(made, small, out, monkeypatch):
+    """Cut off in the midst of copying them, a table goes on with all of them."""
+    files = []
+
+    def cut_off(source, target):
+        files.append(source.name)
+        if len(files) == 2:
+            raise KeyboardInterrupt
+        return target and copy(source, target)
+
+    copy = shutil.copy2
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "copy2", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            main(str(small), Options(), made.engine(), out)
+    assert len(files) == 2
+    assert main(str(small), Options(), made.engine(), out) == ExitCode.DONE
+    found = {file.name for file in (out / "calibrations" / "hand").iterdir()}
+    assert found == {file.name for file in (out / "calibration-0/jobs/calibration-hand/calibrations").iterdir()}
+
+
+def test_a_calibration_that_leaves_no_file_ends_the_table(made, small, out, capsys):
+    made.finds_nothing = True
+    assert main(str(small), Options(), made.engine(), out) == ExitCode.FELL_SHORT
+    assert made.order[-1][0] == "calibration-0"
+    assert "calibration hand: fell_short: it has left no calibration file" in capsys.readouterr().err
+
+
 def test_a_folder_that_holds_something_else_is_refused_and_left_as_it_is(made, small, out):
     out.mkdir()
     (out / "mine.txt").write_text("x")
@@ -104,6 +138,47 @@ def test_a_folder_of_another_seed_is_refused_and_of_the_same_goes_on(made, small
 def test_a_device_that_failed_for_good_is_exit_code_3(made, small, out):
     made.ends["slow-b-3"] = "failed"
     assert main(str(small), Options(), made.engine(), out) == ExitCode.DEVICE_FAILED
+
+
+def test_a_scheduler_that_does_not_answer_leaves_nothing_behind(made, small, out, monkeypatch):
+    monkeypatch.setattr("experiments.campaign.engine.PATIENCE", 0.5)
+    with pytest.raises(InputError, match="nothing answers there"):
+        main(str(small), Options(), replace(made.engine(), scheduler="tcp://127.0.0.1:9"), out)
+    assert not out.exists()
+
+
+def test_a_trial_that_the_tables_counts_ask_for_makes_exit_code_1(made, small, out, capsys):
+    made.status["static-a-1"] = "slipped"
+    assert main(str(small), Options(), made.engine(), out) == ExitCode.FELL_SHORT
+    assert "2 of 12 trials were not completed; 2 of them had to be" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("status", "code"), [("lost_contact", ExitCode.DONE), ("infeasible", ExitCode.FELL_SHORT)])
+def test_a_deviation_that_no_count_asks_about_is_a_result_and_what_was_not_run_is_none(
+    made, small, out, capsys, status, code
+):
+    small.write_text(SMALL.replace("  - {name: done, of: trials completed}\n", ""))
+    made.status["static-a-1"] = status
+    assert main(str(small), Options(), made.engine(), out) == code
+    said = capsys.readouterr().err
+    assert "2 of 12 trials were not completed" in said
+    assert ("no count of the table asks for" in said) == (code is ExitCode.DONE)
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_the_start(made, small, out):
+    with pytest.raises(InputError, match=r"/proc/nope/x\.json: --json: cannot be written"):
+        main(str(small), Options(), made.engine(), out, Path("/proc/nope/x.json"))
+    assert not out.exists() and not made.campaigns
+
+
+def test_a_table_that_cannot_be_kept_is_shown_and_says_where_its_trials_are(made, small, out, monkeypatch, capsys):
+    def full(path, data):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr("experiments.table.run.write_json", full)
+    with pytest.raises(DeviceFault, match=rf"No space left on device.*in {out}"):
+        main(str(small), Options(), made.engine(), out)
+    assert "12 of 12" in capsys.readouterr().out
 
 
 def test_saved_plans_are_executed_again_with_the_stiffness_of_other_fingers(made, small, out):

@@ -74,7 +74,34 @@ def test_a_set_may_change_the_table_itself(small):
         ("trials: 2", "trails: 2", r"line 11: trails: unknown key\n.*\n.*nearest:  trials"),
         ("{name: below,", "{name: done,", r"'done' stands twice"),
         ("of: trials completed", "of: trials", r"counts.0.of: unknown value 'trials'"),
+        (
+            "closed − open, figure: wrench_N",
+            "d, figure: plan_loss",
+            r"comparisons.0.figure: a trial alone has no plan_loss",
+        ),
+        (
+            "closed − open, figure: wrench_N",
+            "d, figure: wrench_summary_N",
+            r"comparisons.0.figure: a trial alone has no wrench_summary_N.*\n.*\n.*nearest:  wrench_N",
+        ),
+        ("{skill: static}", "{controller: mine}", r"line \d+: runs.0.tags.controller: every trial has its own"),
+        ("{skill: static}", "{status: completed}", r"runs.0.tags.status: every trial has its own"),
     ],
 )
 def test_what_a_table_cannot_mean_is_refused_where_it_stands(tmp_path, before, after, message):
     assert re.search(message, refused(tmp_path, before, after)), refused(tmp_path, before, after)
+
+
+@pytest.mark.parametrize(
+    ("added", "message"),
+    [
+        ("{plans_of: again}", r"runs.3.plans_of: again executes plans of static, it makes none\n.*one of slow, static"),
+        ("{plans_of: slow, controllers: []}", r"runs.3.plans_of: without controllers nobody"),
+        ("{plans_of: slow, trajectories: [{name: c}]}", r"runs.3.plans_of: slow has no trajectory 'c'\n.*one of a, b"),
+    ],
+)
+def test_saved_plans_have_to_be_made_by_somebody(tmp_path, added, message):
+    again = "  - {name: again, experiment: grasped_static, plans_of: static}\n"
+    last = f"  - {{name: last, experiment: grasped_static, {added.strip('{}')}}}\n"
+    said = refused(tmp_path, "paper:\n", f"{again}{last}paper:\n")
+    assert re.search(message, said), said

@@ -1,0 +1,1 @@
+"""`extrinsic view`: a recorded run, or a live station, in Rerun."""
