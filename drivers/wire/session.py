@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import socket
 import ssl
+import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +20,23 @@ from drivers.wire.security import Identity
 
 _BATCHES, _VIEW_BATCHES = 16, 8  # of 64 KiB each, made when they are needed
 _LOOK = 1.0  # how long looking for the reason of a refusal may take [s]
+_CALLBACKS, _LAST = (
+    "pyo3-closure",
+    2.0,
+)  # what zenoh's threads of callbacks are called; how long they may take to end [s]
+
+
+@atexit.register
+def _await_callbacks() -> None:
+    """Let the threads end in which zenoh called back, now that every session is closed.
+
+    One that a daemon thread has begun is a daemon, too, and nobody waits for it: the interpreter would end it in the
+    midst of zenoh's own code, which aborts the process.
+    """
+    deadline = time.monotonic() + _LAST
+    for thread in threading.enumerate():
+        if _CALLBACKS in thread.name and thread.daemon:
+            thread.join(max(deadline - time.monotonic(), 0.0))
 
 
 def address(endpoint: str) -> SplitResult:

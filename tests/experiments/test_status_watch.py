@@ -94,7 +94,7 @@ def test_a_station_is_followed_as_it_comes_and_goes_and_q_leaves_the_terminal_as
     host.send_signal(signal.SIGINT)
     watched.until(r"0 of 7 devices alive[\s\S]*gone for \d+ s")
     os.write(watched.ours, b"q")
-    assert watched.end() == 0
+    assert watched.end() == 0, watched.text[-3000:]
     assert watched.text.count(LEAVE) == 1
     after = watched.text.rpartition(LEAVE)[2]
     assert "0 of 7 devices alive" in after, "the last picture stays behind"

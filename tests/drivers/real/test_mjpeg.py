@@ -107,14 +107,14 @@ def test_what_a_camera_may_do_oddly_is_read_all_the_same(fault):
 def test_a_server_that_answers_in_chunks_is_read_to_the_last_pixel():
     """Chunks of 4096 bytes, in the midst of pictures and headers."""
     noise = np.random.default_rng(0).integers(0, 40, (HEIGHT, WIDTH, 3), np.uint8)
-    jpegs = [jpeg(numbered(n) + noise, 95) for n in (7, 8, 9)]
+    jpegs = [jpeg(numbered(n) + noise, 95) for n in (7, 8)]  # two wait for a reader, of more the newest
     body = b"".join(b"--frame\r\nContent-Type: image/jpeg\r\n\r\n" + jpeg + b"\r\n" for jpeg in (*jpegs, jpegs[-1]))
     chunks = [body[i : i + 4096] for i in range(0, len(body), 4096)]
     head = b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=frame\r\n"
     head += b"Transfer-Encoding: chunked\r\n\r\n"
     with (
         server(head, *(b"%x\r\n%s\r\n" % (len(c), c) for c in chunks)) as address,
-        source(address, rate=1000.0) as camera,
+        source(address, rate=1e6) as camera,
     ):
         camera.open(2.0)
         pictures = [next_frame(camera).picture(False) for _ in jpegs]

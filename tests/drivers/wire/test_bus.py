@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from drivers.errors import DeviceFault, DeviceTimeout, NotConnected
-from drivers.wire import messages, topics
+from drivers.wire import messages, session, topics
 from drivers.wire.bus import Bus, Query, open_buses
 from drivers.wire.link import Link
 from drivers.wire.server import Desk
@@ -282,3 +282,22 @@ def test_the_bus_listens_nowhere_but_at_its_endpoint(served: Bus, joined: Bus) -
 def test_keys_are_topic_names() -> None:
     assert topics.key("lab1", "arm", "pose") == "lab1/arm/pose"
     assert topics.holder_of(topics.lease("lab1", "arm", "me~1~2")) == "me~1~2"
+
+
+def test_before_the_process_ends_no_callback_is_left_to_a_thread_that_nobody_waits_for(endpoint: str) -> None:
+    """A bus that a daemon thread opens has callbacks in daemon threads; ended with the interpreter, they abort it."""
+    called_back: list[threading.Thread] = []
+
+    def look_on() -> None:
+        before = set(threading.enumerate())
+        with Bus(endpoint, listen=True, shared_memory=False) as bus:
+            watch = bus.watch(topics.alive("lab", "arm"))
+            called_back.extend(thread for thread in set(threading.enumerate()) - before if "closure" in thread.name)
+            watch.close()
+
+    onlooker = threading.Thread(target=look_on, daemon=True)
+    onlooker.start()
+    onlooker.join(10)
+    assert called_back and all(thread.daemon for thread in called_back)
+    session._await_callbacks()
+    assert not any(thread.is_alive() for thread in called_back)
