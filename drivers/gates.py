@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from drivers.config import ArmLimits
+from drivers.cubic import cubic
 from drivers.errors import CommandRefused, DeviceTimeout, DriverError
 from drivers.interfaces import ArmTarget
 from mechanics import se2
@@ -57,11 +58,9 @@ class _Goal:
         """Pose and twist (3,) by ``now_ns``, along the cubic that arms follow from set-point to set-point."""
         T = max((self.at_ns - self.since_ns) * NANO, SHORTEST)
         s = min(max((now_ns - self.since_ns) * NANO / T, 0.0), 1.0)
-        (p, v), w = self.start, self.twist
-        step = self.pose - p
+        step = self.pose - self.start[0]
         step[2] = se2.wrap(step[2])
-        pose = p + (3 - 2 * s) * s * s * step + s * (1 - s) * T * ((1 - s) * v - s * w)
-        return pose, 6 * s * (1 - s) / T * step + (1 - s) * (1 - 3 * s) * v + s * (3 * s - 2) * w
+        return cubic(self.start, (self.start[0] + step, self.twist), T, s)
 
 
 @dataclass

@@ -9,6 +9,7 @@ from xml.etree.ElementTree import ParseError
 import numpy as np
 from defusedxml import DefusedXmlException, ElementTree
 
+from drivers.cubic import cubic
 from drivers.errors import ProtocolError
 from drivers.interfaces import ArmTarget
 from drivers.real.arm_frames import ArmFrames
@@ -84,10 +85,8 @@ class Way:
 
     def at(self, s: float) -> tuple[Array, Array]:
         """Pose and twist (3,) at the share ``s`` of its time."""
-        T, (p, v, q, w) = self.T, self._ends
-        h = s - 1
-        pose = (1 + 2 * s) * h * h * p + s * h * h * T * v + s * s * (3 - 2 * s) * q + s * s * h * T * w
-        return pose, 6 * s * h * (p - q) / T + h * (3 * s - 1) * v + s * (3 * s - 2) * w
+        pose, twist, goal, arriving = self._ends
+        return cubic((pose, twist), (goal, arriving), self.T, s)
 
 
 class Joints:
