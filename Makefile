@@ -7,7 +7,7 @@ GUIDED ?= 600
 export OMP_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup browser usb demo test test-slow fuzz check format clean
+.PHONY: help setup browser usb demo test test-slow fuzz check docs format clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -65,6 +65,12 @@ check: setup  ## lint, types and the layers
 	@$(BIN)/ruff format --check .
 	@$(BIN)/lint-imports
 	@$(BIN)/pyright
+
+docs: setup  ## the site of docs/, into build/docs, without the network
+	@$(BIN)/python -m experiments.yaml_reference docs/yaml
+	@PYTHONPATH=. $(BIN)/python docs/figures.py docs/images/concepts
+	@$(BIN)/sphinx-build -W --keep-going -q -n -d build/docs-trees docs build/docs
+	@echo "build/docs/index.html"
 
 format: setup  ## format the code
 	@$(BIN)/ruff format .
