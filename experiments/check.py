@@ -14,7 +14,7 @@ from control.motion import PEAK
 from drivers.config import ArmConfig, ForceTorqueConfig, TactileConfig, WorldConfig
 from drivers.sim.mismatch import load_profile
 from drivers.sim.preflight import coupling_of, refuse_impossible
-from experiments import disk, in_view
+from experiments import disk, in_reach, in_view
 from experiments.calibrate.schema import CameraStage, FrictionStage
 from experiments.calibrate.store import Calibrations, load
 from experiments.faults.schema import FaultsStage
@@ -83,6 +83,7 @@ def check(
         for problem in _scene_problems(resolved, eo)
     ]
     problems = problems or in_view.problems(resolved, known, made, plans)
+    problems = problems or in_reach.problems(resolved, made, plans)
     if problems:
         raise InputError(problems)
     experiment, station = resolved.experiment, resolved.station

@@ -6,23 +6,20 @@ A trial looks at them before it begins, and measures by them at every waypoint.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from control.approach import UP, retreat
 from drivers.config import TagCameraConfig
-from experiments.faults.schema import FaultsStage
+from experiments import planned_poses
 from experiments.files import Resolved
-from experiments.schema import ExecuteStage
+from experiments.planned_poses import Poses
 from experiments.setup import Believed
 from mechanics import se2
 from mechanics.camera import CameraModel, TagGeometry, point_in_world
 from mechanics.readings import Array
 from mechanics.yaml_input import Problem
-from planning import closure
 from planning.plan import Plan
-from planning.problem import ANGLE, TRAVEL
 from planning.skills.base import SkillTask
 
 #: the middle of a tag that has to be in the picture, as a share of its edge: an optimised plan differs from the nominal
@@ -34,48 +31,13 @@ _SHARE = 0.9
 _STEP = 0.01
 
 
-@dataclass(frozen=True, eq=False)
-class Poses:
-    """Where a trial of a plan has the bodies: X_W_go (n, 3) and X_W_eo (n, 3), or None without an extrinsic object.
-
-    The first is where it looks whether it may begin, with the go in free air; the others are waypoints.
-    """
-
-    go: Array
-    eo: Array | None
-
-
-def of_plan(plan: Plan, clearance: float) -> Poses:
-    """The poses of a plan, its go ``clearance`` [m] off at first."""
-    air = plan.preload_go[0] + clearance * np.append(retreat(plan), 0.0)
-    eo = None if plan.eo is None or plan.preload_eo is None else np.vstack([plan.preload_eo[:1], plan.eo])
-    return Poses(np.vstack([air, plan.go]), eo)
-
-
-def of_task(task: SkillTask, clearance: float) -> Poses:
-    """The poses of a task's nominal trajectory, from which the plan will hardly differ as far as a camera can tell."""
-    problem, rest = task.problem, task.rest or task.problem
-    y = problem.start * problem.scale
-    placed = closure.place(problem, y[:, ANGLE], y[:, TRAVEL])
-    first = closure.place(rest, y[: len(rest.eo), ANGLE], y[: len(rest.eo), TRAVEL])
-    sign = 1.0 if problem.eo_body is None else -1.0  # normals point into the body acted on: the eo, where there is one
-    away = sign * np.sum(placed.normals[0, : len(problem.contacts)], axis=0)
-    size = float(np.linalg.norm(away))
-    air = first.go[0] + clearance * np.append(UP if size < 1e-6 else away / size, 0.0)
-    eo = None if problem.eo_body is None else np.vstack([first.eo[:1], placed.eo])
-    return Poses(np.vstack([air, placed.go]), eo)
-
-
 def problems(
     resolved: Resolved, known: Believed, tasks: Mapping[str, SkillTask], plans: Mapping[str, Plan]
 ) -> list[Problem]:
     """What of the tags no trial would see: an object that carries none, or one that is not in the picture."""
     if resolved.experiment.rehearse:  # in free air it is the arm alone that counts
         return []
-    clearance = resolved.experiment.trial.clearance_mm * 1e-3
-    named = [s.plan for s in resolved.experiment.stages if isinstance(s, ExecuteStage | FaultsStage)]
-    poses = {name: of_task(tasks[name], clearance) for name in named if name in tasks}
-    poses |= {name: of_plan(plans[name], clearance) for name in named if name in plans}
+    poses = planned_poses.executed(resolved, tasks, plans)
     if not known.tags["eo"] and resolved.extrinsic is not None and any(p.eo is not None for p in poses.values()):
         wrong = f"{resolved.extrinsic.name} has no tag: the camera could not see it"
         return [resolved.experiment_document.problem(("extrinsic_object",), wrong, "an object with a `tag`")]

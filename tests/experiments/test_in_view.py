@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from experiments import in_view
+from experiments import planned_poses
 from experiments.calibrate.store import Calibrations
 from experiments.check import check, tasks
 from experiments.files import load
@@ -79,7 +79,7 @@ def test_the_nominal_trajectory_is_looked_at_as_the_plan_of_it_would_be(experime
     resolved = load(experiment, None, ["calibration.source=none"])
     [task] = tasks(resolved, believed(resolved, Calibrations())).values()
     planned = planner.plan(task, "nominal", objective=objective("fused"))
-    from_task, from_plan = in_view.of_task(task, 0.01), in_view.of_plan(planned, 0.01)
+    from_task, from_plan = planned_poses.of_task(task, 0.01), planned_poses.of_plan(planned, 0.01)
     np.testing.assert_allclose(from_task.go, from_plan.go, atol=1e-9)
     assert (from_task.eo is None) == (from_plan.eo is None)
     if from_task.eo is not None and from_plan.eo is not None:
