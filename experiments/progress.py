@@ -11,13 +11,16 @@ from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
+    ProgressColumn,
     SpinnerColumn,
+    Task,
     TaskProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 from rich.progress import Progress as Bars
+from rich.text import Text
 
 STYLES = {"info": "", "warning": "yellow", "error": "red"}
 
@@ -41,6 +44,19 @@ def counted(console: Console, speed_over: float = 30.0) -> Bars:
         console=console,
         speed_estimate_period=speed_over,
     )
+
+
+class _ByTheClock(ProgressColumn):
+    """How long something is still going to take that takes ``seconds``, whatever it tells of itself."""
+
+    def __init__(self, seconds: float):
+        super().__init__()
+        self._seconds = seconds
+
+    def render(self, task: Task) -> Text:
+        """The time left, or that it should be over by now."""
+        left = round(self._seconds - (task.elapsed or 0.0))
+        return Text(f"{left // 60}:{left % 60:02d} left" if left > 0 else "any moment", style="progress.remaining")
 
 
 class _Steady:
@@ -77,14 +93,15 @@ class Progress:
         self.console = console
 
     @contextmanager
-    def step(self, what: str) -> Iterator[None]:
-        """One thing of unknown length."""
+    def step(self, what: str, seconds: float | None = None) -> Iterator[None]:
+        """One thing that tells nothing of itself; ``seconds`` where it is known how long it takes."""
         if not self.console.is_terminal:
             self.console.print(f"{escape(what)} ...")
             yield
             return
         spinner = SpinnerColumn("line" if self.console.options.ascii_only else "dots")
-        columns = (spinner, TextColumn("{task.description}"), TimeElapsedColumn())
+        columns = [spinner, TextColumn("{task.description}"), TimeElapsedColumn()]
+        columns += [] if seconds is None else [_ByTheClock(seconds)]
         with Bars(*columns, console=self.console) as bars:
             bars.add_task(escape(what), total=None)
             yield

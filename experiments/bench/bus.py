@@ -37,6 +37,8 @@ from experiments.ports import free_endpoint
 
 #: how long each way is measured, in pieces of which each gives a median; and how long an idle station is watched [s]
 SECONDS, PIECES, IDLE = 60.0, 6, 10.0
+#: what processes take to come up, and the idle station, beside what is measured [s]
+AROUND = 45.0
 _ARRIVAL = 2.0  # what has not come by then is lost [s]
 _SETTLE = 2.0  # what it costs a station to begin is over by then [s]
 NAMES = {WRENCH: "wrench, 1 kHz", DEPTH: "depth 640×480, 30 Hz"}

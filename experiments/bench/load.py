@@ -33,6 +33,8 @@ from mechanics.yaml_input import InputError, Problem
 
 EXPERIMENT = "grasped_static"
 MINUTES, VIEWERS = 20.0, 4
+#: what it takes to begin, and to look at the log afterwards, beside those minutes [s]
+AROUND = 60.0
 #: the gates are there, but wide: a set-point that a crowded machine has held up is not to end the measurement
 LIMITS = {
     "age": 5,
