@@ -44,7 +44,7 @@ class Known(Mapping[str, Any]):
         yield from (name for name in announced.names(self._group) if name not in self._ours)
 
     def __len__(self) -> int:
-        return len([*self])
+        return sum(1 for _ in self)
 
     def __contains__(self, name: object) -> bool:
         return name in self._ours or name in announced.names(self._group)
