@@ -73,6 +73,10 @@ C = TypeVar("C", bound=type[Controller])
 
 
 def register(controller: C) -> C:
-    """Make a controller available to experiment files under its name."""
+    """Class decorator: enter a controller of this package under its name."""
+    if controller.name in CONTROLLERS:
+        raise ValueError(
+            f"controller '{controller.name}' is registered twice: {CONTROLLERS[controller.name]}, {controller}"
+        )
     CONTROLLERS[controller.name] = controller
     return controller

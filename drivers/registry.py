@@ -14,9 +14,9 @@ import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
+from mechanics import announced
 from mechanics.yaml_input import Refusal, nearest, one_of
 
 if TYPE_CHECKING:  # the station file's model asks here
@@ -50,28 +50,18 @@ class Driver:
 
 def names() -> tuple[str, ...]:
     """Every driver that a station file can name, ours first."""
-    return (*OURS, *sorted(set(_foreign()) - set(OURS)))
+    return (*OURS, *(name for name in announced.names(GROUP) if name not in OURS))
 
 
 @cache
 def driver(name: str) -> Driver:
-    """The driver of this name. Raises Refusal where there is none, or its package cannot be imported."""
+    """The driver of this name. Raises Refusal where there is none, or its package is not as it should be."""
     if name in OURS:
         return importlib.import_module(OURS[name]).DRIVER
-    if name not in (foreign := _foreign()):
-        raise Refusal(f"unknown value {name[:60]!r}", one_of(names()), nearest(name, names()), ("driver",))
-    entry = foreign[name]
-    try:
-        found = entry.load()
-    except Exception as error:  # somebody else's code: whatever it raises, the user is to know whose it is
-        wrong = f"driver {name!r} ({entry.value}) cannot be imported: {type(error).__name__}: {error}"
-        raise Refusal(wrong, "a package that is installed as it should be", at=("driver",)) from error
-    if not isinstance(found, Driver):
-        wrong = f"driver {name!r} ({entry.value}) is a {type(found).__name__}"
-        raise Refusal(wrong, "a drivers.registry.Driver", at=("driver",))
-    return found
+    if name not in (known := names()):
+        raise Refusal(f"unknown value {name[:60]!r}", one_of(known), nearest(name, known), ("driver",))
+    return announced.load(GROUP, "driver", name, _expected, at=("driver",))
 
 
-@cache
-def _foreign() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
+def _expected(found: object) -> str | None:
+    return None if isinstance(found, Driver) else "a drivers.registry.Driver"

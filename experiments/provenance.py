@@ -8,12 +8,16 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from experiments import __version__
+from mechanics import announced
 
 PACKAGES = ("numpy", "torch", "cvxpy", "cvxpylayers", "mujoco", "eclipse-zenoh", "mcap", "pupil-apriltags")
 
 
 def provenance() -> dict:
-    """Revision (None outside a checkout) with a ``-dirty`` mark, package versions, and the host, JSON-able."""
+    """Revision (None outside a checkout) with a ``-dirty`` mark, package versions, and the host, JSON-able.
+
+    Packages whose drivers, skills, optimisers or controllers were asked for in this process are among the versions.
+    """
     return {"git": revision(), "versions": _versions(), "host": _host()}
 
 
@@ -43,7 +47,7 @@ def _versions() -> dict[str, str]:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return found | announced.loaded()
 
 
 def _host() -> dict[str, str]:

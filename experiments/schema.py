@@ -90,8 +90,7 @@ class HealthConfig(_Model):
 def _known_controllers(names: tuple[str, ...]) -> tuple[str, ...]:
     known = registries.controllers()
     for i, name in enumerate(names):
-        if name not in known:
-            raise Refusal(f"unknown controller {name!r}", one_of(known), nearest(name, known), at=(i,))
+        known.named(name, at=(i,))
         if name in names[:i]:
             raise Refusal(f"the controller {name!r} stands twice", "each controller once", at=(i,))
     return names
@@ -110,7 +109,7 @@ class ExecuteStage(_Model):
         tuple[str, ...],
         Field(min_length=1, description="each runs every trial"),
         AfterValidator(_known_controllers),
-        Offered(registries.controllers),
+        Offered(lambda: registries.controllers().usable()),
     ]
     settings: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="the laws' figures, by the controller's name"
@@ -130,15 +129,15 @@ class ExecuteStage(_Model):
         """The model of the laws' settings, where ``data`` names controllers."""
         if key != "settings":
             return None
-        known = registries.controllers()
-        names = [name for name in data.get("controllers", ()) if isinstance(name, str) and name in known]
-        fields: dict[str, Any] = {name: (known[name].Settings, known[name].Settings()) for name in names}
+        names = data.get("controllers")
+        laws = registries.controllers().usable(names if isinstance(names, list | tuple) else ())
+        fields: dict[str, Any] = {name: (law.Settings, law.Settings()) for name, law in laws.items()}
         return create_model("settings", __config__=_Model.model_config, **fields)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> Schema:
         """As a file has it: settings by the laws' own models."""
-        found, laws = handler.resolve_ref_schema(handler(core)), registries.controllers()
+        found, laws = handler.resolve_ref_schema(handler(core)), registries.controllers().usable()
         models = {name: reference(laws[name].Settings, handler) for name in sorted(laws)}
         settings = found["properties"]["settings"]
         found["properties"]["settings"] = {**settings, "properties": models, "additionalProperties": False}

@@ -13,7 +13,7 @@ from pydantic_core import CoreSchema
 from experiments import registries
 from experiments.planning.settings import model_of, optimiser_model
 from mechanics.json_schema import Schema, reference, when
-from mechanics.yaml_input import Refusal, nearest, one_of, validated
+from mechanics.yaml_input import Refusal, validated
 from planning.problem import Form, Limits, LossWeights, PlanarArm
 
 if TYPE_CHECKING:
@@ -144,24 +144,24 @@ class PlanStage(_Model):
     def submodel(cls, key: str, data: dict[str, Any]) -> type[BaseModel] | None:
         """The model of the skill's parameters or the optimiser's settings, where the data names skill and optimiser."""
         if key == "parameters":
-            skill = registries.skills().get(str(data.get("skill")))
-            return None if skill is None else skill.Parameters
+            found = registries.skills().usable([data.get("skill")])
+            return next((skill.Parameters for skill in found.values()), None)
         if key == "optimiser":
-            name = str(_optimiser_name(data.get("optimiser", {})))
-            return optimiser_model(name) if name in registries.optimisers() else None
+            found = registries.optimisers().usable([_optimiser_name(data.get("optimiser", {}))])
+            return next((optimiser_model(name) for name in found), None)
         return None
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> Schema:
         """As a file has it: parameters by the skill's name, the optimiser by name or with its settings."""
         found = handler.resolve_ref_schema(handler(core))
-        properties, skills, optimisers = found["properties"], registries.skills(), registries.optimisers()
+        properties, skills = found["properties"], registries.skills().usable()
         properties["skill"]["enum"] = sorted(skills)
         found["allOf"] = [
             when({"skill": name}, {"properties": {"parameters": reference(skills[name].Parameters, handler)}})
             for name in sorted(skills)
         ]
-        names = {"type": "string", "enum": sorted(optimisers)}
+        names = {"type": "string", "enum": sorted(registries.optimisers().usable())}
         settings = {name: reference(optimiser_model(name), handler) for name in names["enum"]}
         properties["optimiser"] = {
             **{key: properties["optimiser"][key] for key in ("title", "description")},
@@ -187,14 +187,11 @@ class PlanStage(_Model):
         data = {**data, **_with_optimiser(data.get("optimiser", DEFAULT_OPTIMISER))}
         if not isinstance(data.get("skill"), str):
             return data
-        known = registries.skills()
-        if data["skill"] not in known:
-            name = data["skill"]
-            raise Refusal(f"unknown skill {name!r}", one_of(known), nearest(name, known), at=("skill",))
+        skill = registries.skills().named(data["skill"], at=("skill",))
         parameters = data.get("parameters", {})
         if not isinstance(parameters, dict):
             return data
-        model = validated(known[data["skill"]].Parameters, parameters, at=("parameters",))
+        model = validated(skill.Parameters, parameters, at=("parameters",))
         return {**data, "parameters": model.model_dump(mode="json")}
 
     @cached_property
@@ -226,12 +223,10 @@ def _optimiser_name(optimiser: Any) -> Any:
 
 def _with_optimiser(optimiser: Any) -> dict[str, Any]:
     """``optimiser`` with its name and every default, in a mapping under its key. Raises Refusal."""
-    name, known = _optimiser_name(optimiser), registries.optimisers()
+    name = _optimiser_name(optimiser)
     if not isinstance(name, str):
         return {"optimiser": optimiser}
-    if name not in known:
-        at = ("optimiser", "name") if isinstance(optimiser, dict) else ("optimiser",)
-        raise Refusal(f"unknown optimiser {name!r}", one_of(known), nearest(name, known), at=at)
+    registries.optimisers().named(name, at=("optimiser", "name") if isinstance(optimiser, dict) else ("optimiser",))
     given = optimiser if isinstance(optimiser, dict) else {"name": name}
     settings = validated(optimiser_model(name), given, at=("optimiser",)).model_dump(mode="json")
     try:

@@ -69,15 +69,16 @@ def _of_trials(name: str) -> str:
 def _known_controllers(names: tuple[str, ...]) -> tuple[str, ...]:
     known = registries.controllers()
     for i, name in enumerate(names):
-        if name not in known:
-            raise Refusal(f"unknown controller {name!r}", one_of(known), nearest(name, known), at=(i,))
+        known.named(name, at=(i,))
     return names
 
 
 Figure = Annotated[str, AfterValidator(_known_figure), Offered(lambda: HEADINGS)]
 TrialFigure = Annotated[str, AfterValidator(_of_trials), Offered(lambda: ERRORS)]
 Figures = Annotated[tuple[str, ...], Field(min_length=1), AfterValidator(_known_figures), Offered(lambda: HEADINGS)]
-Controllers = Annotated[tuple[str, ...], AfterValidator(_known_controllers), Offered(registries.controllers)]
+Controllers = Annotated[
+    tuple[str, ...], AfterValidator(_known_controllers), Offered(lambda: registries.controllers().usable())
+]
 
 
 class CalibrationEntry(_Model):
