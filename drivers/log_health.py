@@ -164,6 +164,11 @@ class LogHealth:
         found = [stream for stream in self._streams.values() if stream is not None]
         return [_fared(stream, devices.get(stream.device), lockstep) for stream in sorted(found, key=_named)]
 
+    def silent(self, devices: Mapping[str, Description], *, lockstep: bool) -> dict[str, bool]:
+        """The ``devices`` that carried no reading, and whether that is no wonder: in lockstep nobody may have asked."""
+        spoke = {stream.device for stream in self._streams.values() if stream is not None}
+        return {name: lockstep and said.kind in _ASKED for name, said in devices.items() if name not in spoke}
+
     def gates(self) -> list[GateHealth]:
         """Every arm whose gates spoke."""
         found = []

@@ -39,12 +39,14 @@ def told(
         ]
         plain = asdict(stream) | {key: worst(getattr(stream, key)) for key in ("silence", "age", "gap")}
         streams.append(plain | {"conditions": conditions})
-    spoke = {stream["device"] for stream in streams}
     gates = [
         asdict(gate) | {"troubles": [[(at - origin_ns) * NANO, text] for at, text in gate.troubles]}
         for gate in health.gates()
     ]
-    silent = [{"device": name, "kind": said.kind} for name, said in devices.items() if name not in spoke]
+    silent = [
+        {"device": name, "kind": devices[name].kind, "on_request": asked}
+        for name, asked in health.silent(devices, lockstep=lockstep).items()
+    ]
     return {"streams": streams, "silent": silent, "gates": gates}
 
 
@@ -68,10 +70,12 @@ def section(health: Any, events: Any) -> dict[str, Any] | None:
         rows.append(_row(stream, device, _of_device(device, gates.get(device), events) if first else []))
     for device in silent:
         name = str(device.get("device"))
-        bare = {"device": name, "of": words(device.get("kind")), "messages": "0", "rate": ("none", "", True)}
+        asked = bool(device.get("on_request"))
+        rate = ("on request", "", False) if asked else ("none", "", True)
+        bare = {"device": name, "of": words(device.get("kind")), "messages": "0", "rate": rate}
         nothing = dict.fromkeys(("silence", "age", "gaps"), ("–", "", False))
-        said = ["the log has no reading of it", *_of_device(name, gates.get(name), events)]
-        rows.append({**bare, **nothing, "notes": said, "well": False})
+        why = "nobody asked it for a reading" if asked else "the log has no reading of it"
+        rows.append({**bare, **nothing, "notes": [why, *_of_device(name, gates.get(name), events)], "well": asked})
     return {"rows": rows, "ages": any(row["age"][0] != "–" for row in rows), "troubled": _troubled(rows)}
 
 
@@ -143,4 +147,4 @@ def _troubled(rows: list[dict[str, Any]]) -> str:
     troubled = list(dict.fromkeys(row["device"] for row in rows if not row["well"]))
     if not troubled:
         return "Every device spoke as it says of itself, and no message is missing from the log."
-    return f"Not all was well with {', '.join(troubled)}: what is marked."
+    return f"Not all was well with {', '.join(troubled)}; what was not is marked."

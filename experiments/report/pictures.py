@@ -125,15 +125,18 @@ class Pictures:
 
     def _moved(self, strip: Strip, depth: Image) -> Image | None:
         """How far the membrane has come toward the camera (h, w) [units of depth]; 0 where that is not known."""
-        if strip.base is None:
+        base = strip.base
+        if base is None:
             untouched = self._untouched.get(strip.device)
-            known = untouched is not None and untouched.shape == depth.shape
-            strip.base = untouched if known else depth
-            strip.against = "the untouched finger" if known else "the first picture of the trial"
-        if strip.base.shape != depth.shape:
+            if untouched is not None and untouched.shape == depth.shape:
+                base, strip.against = untouched, "the untouched finger"
+            else:
+                base, strip.against = depth, "the first picture of the trial"
+            strip.base = base
+        if base.shape != depth.shape:
             return None
-        valid = ((depth > 0) & (strip.base > 0)).astype(np.float32)
-        moved = (strip.base.astype(np.float32) - depth) * valid
+        valid = ((depth > 0) & (base > 0)).astype(np.float32)
+        moved = (base.astype(np.float32) - depth) * valid
         share = _shrunk(valid, COLUMNS["deformation"])
         return np.where(share > 0, _shrunk(moved, COLUMNS["deformation"]) / np.maximum(share, 1e-6), 0.0)
 
