@@ -31,6 +31,8 @@ from mechanics.yaml_input import InputError, Problem
 from planning.plan import Plan
 
 SECOND = 1e-9
+#: kinds of devices that take pictures, in the order in which these are shown
+IMAGERS = ("tactile", "tag_camera")
 
 
 def collect(folder: RunFolder, heard: Heard = unheard) -> dict[str, Any]:
@@ -74,6 +76,7 @@ def collect(folder: RunFolder, heard: Heard = unheard) -> dict[str, Any]:
             for event in log.events
         ],
         "health": device_health.told(health, devices, lockstep=lockstep, origin_ns=origin_ns),
+        "imagers": [name for kind in IMAGERS for name, said in devices.items() if said.kind == kind],
         "plans": convergence.found(folder.path, results.get("plans") or []),
         "paper": beside(results.get("trials", [])),
         "calibration": {

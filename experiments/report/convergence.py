@@ -7,11 +7,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.report.summary import is_number, mapping, words
+from experiments.report.summary import duration, is_number, mapping, words
 from planning.plan_file import PlanFileError, load
 
 HEIGHT = 260  # [px]
 MOST = 1000  # points of a curve
+LEAST = 1e-6  # of the loss, that a term which is told adds to it
+ENDED = {"converged": "it converged", "iterations": "its budget was spent", "stalled": "it stalled"}
 STYLES: dict[str, dict[str, Any]] = {
     "loss": {
         **{"type": "scatter", "mode": "lines+markers", "name": "loss", "line": {"width": 1.5}, "marker": {"size": 4}},
@@ -63,10 +65,10 @@ def _figure(plan: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any] 
     keep = sorted({round(i * (len(points) - 1) / (MOST - 1)) for i in range(MOST)}) if len(points) > MOST else None
     points = points if keep is None else [points[i] for i in keep]
     losses = [y for _, y in points]
-    ended = words(told.get("ended"))
+    ended = ENDED.get(str(told.get("ended")), words(told.get("ended")))
     fall = f"from {losses[0]:.4g} to {min(losses):.4g}"
     text = f"Loss {fall} in {_count(plan.get('queries'))} queries and {_seconds(told.get('optimising_s'))}; {ended}."
-    terms = {str(k): v for k, v in mapping(told.get("terms")).items() if is_number(v) and v}
+    terms = {str(k): v for k, v in mapping(told.get("terms")).items() if is_number(v) and abs(v) > LEAST * min(losses)}
     shortfalls = [str(item) for item in _list(told.get("shortfalls"))]
     return {
         "name": str(plan.get("name")),
@@ -104,4 +106,4 @@ def _count(value: Any) -> str:
 
 
 def _seconds(value: Any) -> str:
-    return f"{value:.3g} s" if is_number(value) else "an unknown time"
+    return duration(value) if is_number(value) else "an unknown time"

@@ -9,7 +9,7 @@ from typing import Any
 from drivers.health import CONFIRMED, WORDS
 from drivers.interfaces import Description
 from drivers.log_health import LogHealth, Worst
-from experiments.report.summary import is_number, mapping, words
+from experiments.report.summary import duration, is_number, mapping, words
 
 NANO = 1e-9
 #: silences that are longer than a device's usual ones by this [s] are marked
@@ -115,8 +115,7 @@ def _lasting(worst: Any, most: float) -> tuple[str, str, bool]:
     value = mapping(worst).get("value")
     if not is_number(value):
         return "–", "", False
-    text = f"{value * 1e3:.3g} ms" if abs(value) < 1 else f"{value:.3g} s"
-    return text, _when(mapping(worst)), value > most
+    return duration(value), _when(mapping(worst)), value > most
 
 
 def _when(worst: Mapping[str, Any]) -> str:

@@ -28,9 +28,10 @@ def render(data: Mapping[str, Any]) -> str:
     [m]), ``grasp`` X_go_gocf, ``trials`` (waypoints and playback: poses (x, y, θ) in W, wrenches (fx, fy, τ) of the
     sensor on the go about the grasp centre, axes of W, contacts with point and force in W; SI), ``log``, ``events``,
     ``paper`` (see `summary.error_table`), ``plans`` (see `convergence.found`), ``health`` (see `device_health.told`), a
-    trial's ``pictures`` (see `pictures.Strip.json`), ``calibration`` (see `calibration_table.section`; ``only``: the
-    run was to do nothing else). What is missing, None or NaN is left out and the page says so, so that an
-    aborted, empty or torn run has its report as well. Raises TypeError when ``data`` is no mapping.
+    trial's ``pictures`` (see `pictures.Strip.json`), ``imagers`` (the devices that take some), ``calibration`` (see
+    `calibration_table.section`; ``only``: the run was to do nothing else). What is missing, None or NaN is left out and
+    the page says so, so that an aborted, empty or torn run has its report as well. Raises TypeError when ``data`` is no
+    mapping.
     """
     if not isinstance(data, Mapping):
         raise TypeError(f"render: expected a mapping with results, trials, objects …, got {type(data).__name__}")
@@ -45,8 +46,8 @@ def render(data: Mapping[str, Any]) -> str:
         figure["index"] = index
     styles = {**calibration.styles(), **convergence.STYLES}
     drawings = payload.encode({"figures": [_drawing(figure) for figure in drawn], "styles": styles})
-    shots = pictures.carried(_list(data.get("trials")))
-    shown = payload.encode(shots) if any(shots["trials"]) else ""
+    shots = pictures.carried(_list(data.get("trials")), data.get("imagers"))
+    shown = payload.encode(shots) if any(shots["trials"]) or shots["imagers"] else ""
     carried = payload.build(data, reserved=len(shown) + (len(drawings) if drawn else 0))
     carried["figures"] = [traces.figure(trial) for trial in carried["trials"]]
     carried["styles"] = traces.styles()

@@ -5,7 +5,7 @@
 (() => {
   const holder = document.getElementById("pictures"), facts = document.getElementById("pictures-facts");
   const found = document.getElementById("pictures-data");
-  const data = found ? JSON.parse(found.textContent) : { trials: [] };
+  const data = found ? JSON.parse(found.textContent) : { trials: [], imagers: [] };
   const drawn = new Map();  // shot → the canvas with its picture
   let strips = [];
 
@@ -78,7 +78,10 @@
     drawn.clear();
     holder.replaceChildren(...strips.map((seat) => seat.figure));
     if (fingers.length) holder.append(scale(fingers));
-    document.getElementById("no-pictures").hidden = own.length > 0;
+    const silent = data.imagers.filter((device) => !own.some((strip) => strip.device === device)), note = document.getElementById("no-pictures");
+    note.hidden = own.length > 0 && silent.length === 0;
+    note.textContent = `The log has no picture of ${silent.join(", ") || "fingers or camera"} in this trial: `
+      + "they send pictures only while somebody listens, and in lockstep only when a controller looks.";
     const count = Math.max(0, ...own.map((strip) => strip.shots.length)), all = Player.data.trials[index].waypoints?.t.length || 0;
     facts.textContent = own.length ? `as of the newest waypoint${count < all ? `; ${count} of ${all} waypoints have one` : ""}` : "";
     show(Player.time);

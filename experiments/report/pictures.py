@@ -173,20 +173,24 @@ def colours(count: int = 16) -> list[str]:
     return [f"#{r:02x}{g:02x}{b:02x}" for b, g, r in blue_green_red.tolist()]
 
 
-def carried(trials: Iterable[Any]) -> dict[str, Any]:
+def carried(trials: Iterable[Any], imagers: Any = None) -> dict[str, Any]:
     """What the page has of the pictures: per trial its devices', with one ``reach`` [mm] for all fingers of a trial.
 
-    ``unit`` and ``zero`` turn a grey value g into a deformation [mm]: (g − zero) · unit.
+    ``imagers`` are the devices that could have sent some, in the order in which they are shown. ``unit`` and ``zero``
+    turn a grey value g into a deformation [mm]: (g − zero) · unit.
     """
-    found = [_devices(trial) for trial in trials]
-    return {"trials": found, "unit": round(_MM, 6), "zero": ZERO, "colours": colours()}
+    names = [str(name) for name in imagers] if isinstance(imagers, list) else []
+    found = [_devices(trial, names) for trial in trials]
+    scale = {"unit": round(_MM, 6), "zero": ZERO, "colours": colours()}
+    return {"trials": found, "imagers": names, **scale}
 
 
-def _devices(trial: Any) -> list[dict[str, Any]]:
+def _devices(trial: Any, names: list[str]) -> list[dict[str, Any]]:
     strips = trial.get("pictures") if isinstance(trial, Mapping) else None
     shown = [dict(strip) for strip in strips or [] if isinstance(strip, Mapping) and strip.get("shots")]
     reach = max([strip["reach"] for strip in shown if strip["kind"] == "deformation"], default=0.0)
     for strip in shown:
         strip["reach"] = max(1.0, float(np.ceil(2 * reach) / 2)) if strip["kind"] == "deformation" else 0.0
         strip["shots"] = [[round(t, 4), step, data] for t, step, data in strip["shots"]]
-    return sorted(shown, key=lambda strip: (strip["kind"] != "deformation", strip["device"]))
+    order = {name: place for place, name in enumerate(names)}
+    return sorted(shown, key=lambda s: (order.get(s["device"], len(order)), s["kind"] != "deformation", s["device"]))

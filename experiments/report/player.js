@@ -176,6 +176,7 @@ const Player = (() => {
   const choose = (index) => {
     play(false);
     trial = data.trials[index];
+    $("trial-name").textContent = trial.name;
     $("trial-facts").textContent = [trial.skill, trial.controller, trial.status].filter(Boolean).map((w) => w.replaceAll("_", " ")).join(" · ")
       + (trial.reason ? `: ${trial.reason}` : "");
     $("stage").hidden = !trial.playback;

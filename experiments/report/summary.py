@@ -170,6 +170,11 @@ def is_number(value: Any) -> TypeGuard[int | float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
+def duration(seconds: float) -> str:
+    """A time [s] to three digits, with its unit."""
+    return f"{seconds * 1e3:.3g} ms" if abs(seconds) < 1 else f"{seconds:.3g} s"
+
+
 def log_summary(log: Any, trials: int) -> dict[str, Any] | None:
     """What the log holds, per topic and in sum; None where there is no log.
 

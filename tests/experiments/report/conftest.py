@@ -77,6 +77,7 @@ def extrinsic():
     camera = build_pictures(times, "camera", "picture", size=(64, 36), every=2)
     good["pictures"] = [build_pictures(times), build_pictures(times, "finger_right"), camera]
     run = build_run([good, bad], status="completed", eo=True)
+    run["imagers"] = ["finger_left", "finger_right", "camera"]
     figures = {"go_pose_mm": {"mean": 1.26, "std": 0.98}, "eo_pose_mm": {"mean": 0.31, "std": 0.32}}
     run["paper"] = {"source": "Table 2", "rows": {good["name"]: figures}}
     return run

@@ -184,7 +184,7 @@ def test_every_calibration_is_a_row_with_its_file_and_date(calibrated, find_cell
 def test_a_calibration_that_was_only_used_is_a_row_without_a_figure(grasped, find_cells):
     page = render(grasped)
     assert find_cells(page, "calibrations")[0][3] == "2025-11-20 08:15 UTC run calibrate-20251120T080000"
-    assert 'id="drawings"' not in page
+    assert 'class="calibration-plot"' not in page
     assert "could not be drawn" not in page
 
 

@@ -82,7 +82,7 @@ def test_a_plan_is_drawn_as_loss_against_queries_on_a_logarithmic_scale():
     assert (trace["y"][0], trace["y"][-1]) == pytest.approx((10.0, 0.01))
     assert figure["layout"]["yaxis"]["type"] == "log"
     assert figure["layout"]["xaxis"]["title"]["text"] == "queries"
-    assert figure["text"] == "Loss from 10 to 0.01 in 100 queries and 0.25 s; iterations."
+    assert figure["text"] == "Loss from 10 to 0.01 in 100 queries and 250 ms; its budget was spent."
     assert figure["terms"] == [("cone", "0.007"), ("smooth", "0.003")]
 
 

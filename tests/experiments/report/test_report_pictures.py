@@ -138,6 +138,8 @@ def test_all_fingers_of_a_trial_have_one_scale_and_stand_before_the_camera():
     ]
     [found] = carried([{"pictures": strips}])["trials"]
     assert [(strip["device"], strip["reach"]) for strip in found] == [("b", 7.5), ("c", 7.5), ("a", 0.0)]
+    [found] = carried([{"pictures": strips}], ["c", "a"])["trials"]
+    assert [strip["device"] for strip in found] == ["c", "a", "b"]
 
 
 def test_the_colours_are_those_of_viridis():
