@@ -26,7 +26,8 @@ from experiments.metrics import contact_of, errors_of
 from experiments.planning.files import FOLDER as PLANS
 from experiments.progress import Progress
 from experiments.report.build import build_report
-from experiments.report.collect import LoggedTrial, Logs, plan_of, read_logs
+from experiments.report.collect import plan_of
+from experiments.report.logged import LoggedTrial, Logs, read_logs
 from experiments.results_file import BEGUN, Begun, ShownResults, parse_json, read_json
 from experiments.run_folder import RunFolder, write_atomic, write_json
 from experiments.run_lock import RunLock

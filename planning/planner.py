@@ -123,6 +123,7 @@ def plan(
             "weights": {item.name: getattr(problem.weights, item.name) for item in fields(problem.weights)},
             "terms": found.terms,
             "curve": _curve(optimum, found.value),
+            "curve_queries": [1] if optimum is None else list(optimum.asked),
             "margins": {item.name: getattr(margins, item.name) for item in fields(margins)},
             "shortfalls": shortfalls,
         },

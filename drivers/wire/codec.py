@@ -123,12 +123,25 @@ def decode_diagnostics(payload: bytes) -> tuple[int, list[tuple[int, str]]]:
     return messages.stamp_ns(value.header.stamp), [(int(s.level), f"{s.name}: {s.message}") for s in value.status]
 
 
+def decode_gates(payload: bytes) -> tuple[str, dict[str, int]]:
+    """What the gates of an arm say where something is the matter, else nothing, and their counts. Raises ProtocolError.
+
+    The counts are ``accepted`` and ``refused by <gate>``, of set-points since the arm's server began.
+    """
+    value = messages.decode(payload, messages.DIAGNOSTICS)
+    said = "; ".join(part.message for part in value.status if int(part.level))
+    pairs = [(pair.key, pair.value) for part in value.status for pair in part.values]
+    return said, {key: int(text) for key, text in pairs if text.isdecimal() and len(text) < _COUNT}
+
+
 Stamper = Callable[[int, str], Stamp]
 
 
 def _stamped(header: Any, stamp: Stamper) -> Stamp:
     return stamp(messages.stamp_ns(header.stamp), header.frame_id)
 
+
+_COUNT = 18  # digits of a count that is one
 
 # Poses and wrenches: encapsulation, seconds, nanoseconds, length of the frame's name; the name; aligned doubles.
 _HEAD = struct.Struct("<4siII")

@@ -5,53 +5,34 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drivers.errors import ProtocolError
-from drivers.wire.log_reader import LogReader
+from drivers.errors import DriverError
+from drivers.interfaces import Description
+from drivers.log_health import LogHealth
+from drivers.replay.contents import contents_of
 from experiments.calibrate.models import friction_name, tag_name
 from experiments.calibrate.samples import load_samples
 from experiments.calibrate.store import prints
 from experiments.files import Resolved, load
 from experiments.paper import beside
 from experiments.progress import Heard, unheard
+from experiments.report import convergence, device_health
+from experiments.report.logged import LoggedTrial, read_logs
+from experiments.report.pictures import Pictures
 from experiments.results_file import ShownResults, read_json
 from experiments.run_folder import RunFolder
 from mechanics import se2
-from mechanics.readings import TruthReading
-from mechanics.records import EventRecord, PhaseRecord, PlanarState, TrialRecord, WaypointRecord
+from mechanics.records import PlanarState, TrialRecord
 from mechanics.yaml_input import InputError, Problem
 from planning.plan import Plan
 
 SECOND = 1e-9
-_TELL = 1000  # messages
-
-
-@dataclass
-class LoggedTrial:
-    """A trial as the log has it; ``end`` is None where the log breaks off within it."""
-
-    begin: TrialRecord
-    end: TrialRecord | None = None
-    waypoints: list[WaypointRecord] = field(default_factory=list)
-    phases: list[PhaseRecord] = field(default_factory=list)
-    truths: list[TruthReading] = field(default_factory=list)
-
-
-@dataclass
-class Logs:
-    """What the logs of a run folder say, one after the other; ``ending`` says how the first broke off that did."""
-
-    trials: list[LoggedTrial] = field(default_factory=list)
-    events: list[EventRecord] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=dict)
-    length_ns: int = 0
-    ending: str = "there is no log"
-    current: LoggedTrial | None = None
+#: kinds of devices that take pictures, in the order in which these are shown
+IMAGERS = ("tactile", "tag_camera")
 
 
 def collect(folder: RunFolder, heard: Heard = unheard) -> dict[str, Any]:
@@ -64,7 +45,10 @@ def collect(folder: RunFolder, heard: Heard = unheard) -> dict[str, Any]:
     resolved = load(str(folder.experiment))
     results = _results(folder)
     known = results.get("calibration") or {}
-    log, files = read_logs(folder, resolved.experiment.report.playback_rate, heard), folder.logs()
+    files, pictures, health = folder.logs(), Pictures(), LogHealth()
+    log = read_logs(folder, resolved.experiment.report.playback_rate, heard, pictures=pictures, health=health)
+    devices, lockstep = _devices(folder)
+    origin_ns = 0 if lockstep else log.begin_ns or 0  # in lockstep station time begins with the run
     mended = [told for told in (results.get("repair") or {"logs": []})["logs"] if told["ending"] != "complete"]
     if log.ending == "complete" and mended:
         log.ending = f"{mended[0]['ending']}; what was whole has been mended"
@@ -87,7 +71,13 @@ def collect(folder: RunFolder, heard: Heard = unheard) -> dict[str, Any]:
             "seconds": log.length_ns * SECOND,
             "ending": log.ending,
         },
-        "events": [{"t": event.capture_ns * SECOND, "level": event.level, "text": event.text} for event in log.events],
+        "events": [
+            {"t": (event.capture_ns - origin_ns) * SECOND, "level": event.level, "text": event.text}
+            for event in log.events
+        ],
+        "health": device_health.told(health, devices, lockstep=lockstep, origin_ns=origin_ns),
+        "imagers": [name for kind in IMAGERS for name, said in devices.items() if said.kind == kind],
+        "plans": convergence.found(folder.path, results.get("plans") or []),
         "paper": beside(results.get("trials", [])),
         "calibration": {
             "made": [file.stem for file in sorted(folder.calibration.glob("*.yaml")) if file.stem in known],
@@ -96,6 +86,15 @@ def collect(folder: RunFolder, heard: Heard = unheard) -> dict[str, Any]:
             "only": all(stage.stage.startswith("calibrate_") for stage in resolved.experiment.stages),
         },
     }
+
+
+def _devices(folder: RunFolder) -> tuple[dict[str, Description], bool]:
+    """What the log's devices say of themselves, and whether time stood still while somebody waited."""
+    try:
+        found = contents_of(folder.path)
+    except DriverError:
+        return {}, False
+    return found.devices, found.lockstep
 
 
 def _results(folder: RunFolder) -> dict[str, Any]:
@@ -147,70 +146,6 @@ def _nominal(resolved: Resolved) -> list[dict[str, Any]]:
     ]
 
 
-def read_logs(folder: RunFolder, rate: float, heard: Heard = unheard) -> Logs:
-    """One pass over the logs of a run; truth is thinned to ``rate`` [Hz] on the way. ``heard`` as in `collect`.
-
-    Of a trial that was run again, in the same log or in that of the run that went on, the last attempt counts.
-    """
-    log, files = Logs(), folder.logs()
-    for number, file in enumerate(files):
-        log.current = None
-        ending = _read(file, log, rate, lambda share, before=number: heard((before + share) / len(files)))
-        if log.ending in ("complete", "there is no log"):
-            log.ending = ending
-    return log
-
-
-def _read(file: Path, log: Logs, rate: float, heard: Heard) -> str:
-    """Add what is in one file; how it ends."""
-    try:
-        reader = LogReader(file)
-    except ProtocolError as error:
-        return error.got
-    last_ns = next_truth = 0
-    for count, message in enumerate(reader.messages()):
-        if count % _TELL == 0:
-            heard(reader.share)
-        log.counts[message.topic] = log.counts.get(message.topic, 0) + 1
-        last_ns = max(last_ns, message.publish_ns)
-        is_truth = message.topic.endswith("/world/truth")
-        if is_truth and message.publish_ns < next_truth:
-            continue
-        if not is_truth and not message.topic.startswith("run/"):
-            continue
-        try:
-            value = message.value()
-        except ProtocolError:
-            continue
-        if isinstance(value, TruthReading):
-            next_truth = message.publish_ns + round(1e9 / rate) - 1
-        _file(log, value)
-    log.length_ns += last_ns
-    return reader.ending
-
-
-def _file(log: Logs, value: object) -> None:
-    current = log.current
-    if isinstance(value, EventRecord):
-        log.events.append(value)
-    elif isinstance(value, TrialRecord):
-        if value.status and current is not None:
-            current.end, log.current = value, None
-        elif not value.status:
-            log.current = LoggedTrial(value)
-            if log.trials and log.trials[-1].begin.trial == value.trial:
-                log.trials.pop()
-            log.trials.append(log.current)
-    elif current is None:
-        return
-    elif isinstance(value, WaypointRecord):
-        current.waypoints.append(value)
-    elif isinstance(value, PhaseRecord):
-        current.phases.append(value)
-    elif isinstance(value, TruthReading):
-        current.truths.append(value)
-
-
 def _trial(trial: LoggedTrial, grasp: Any) -> dict[str, Any]:
     begin, end = trial.begin, trial.end
     start_ns = begin.capture_ns
@@ -220,6 +155,7 @@ def _trial(trial: LoggedTrial, grasp: Any) -> dict[str, Any]:
         "controller": begin.controller,
         "status": "unfinished" if end is None else end.status,
         "reason": "the log breaks off here" if end is None else end.reason,
+        "pictures": [strip.json(start_ns) for strip in trial.pictures.values()],
         "waypoints": _waypoints(trial, start_ns),
         "playback": _playback(trial, start_ns) if trial.truths else _from_waypoints(trial, start_ns),
     }
@@ -276,6 +212,7 @@ def planned_contacts(plan: Plan, step: int) -> list[dict[str, Any]]:
                 "normal": normal.tolist(),
                 "force": force.tolist(),
                 "mode": plan.contact_modes[step][c].value,
+                "mu": float(plan.contact_mu[c]),
             }
         )
     return out

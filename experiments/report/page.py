@@ -7,9 +7,18 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from experiments.report import calibration, calibration_table, payload, summary, traces
+from experiments.report import (
+    calibration,
+    calibration_table,
+    convergence,
+    device_health,
+    payload,
+    pictures,
+    summary,
+    traces,
+)
 
-SCRIPTS = ("paper.js", "scene.js", "player.js", "plots.js", "traces.js", "calibration.js")
+SCRIPTS = ("theme.js", "paper.js", "scene.js", "pictures.js", "player.js", "plots.js", "traces.js", "figures.js")
 
 
 def render(data: Mapping[str, Any]) -> str:
@@ -18,9 +27,11 @@ def render(data: Mapping[str, Any]) -> str:
     ``data`` is JSON-able: ``results`` (results.json), ``title``, ``created``, ``objects`` (outlines in body frames
     [m]), ``grasp`` X_go_gocf, ``trials`` (waypoints and playback: poses (x, y, θ) in W, wrenches (fx, fy, τ) of the
     sensor on the go about the grasp centre, axes of W, contacts with point and force in W; SI), ``log``, ``events``,
-    ``paper`` (see `summary.error_table`), ``calibration`` (see `calibration_table.section`; ``only``: the run was to do
-    nothing else). What is missing, None or NaN is left out and the page says so, so that an
-    aborted, empty or torn run has its report as well. Raises TypeError when ``data`` is no mapping.
+    ``paper`` (see `summary.error_table`), ``plans`` (see `convergence.found`), ``health`` (see `device_health.told`), a
+    trial's ``pictures`` (see `pictures.Strip.json`), ``imagers`` (the devices that take some), ``calibration`` (see
+    `calibration_table.section`; ``only``: the run was to do nothing else). What is missing, None or NaN is left out and
+    the page says so, so that an aborted, empty or torn run has its report as well. Raises TypeError when ``data`` is no
+    mapping.
     """
     if not isinstance(data, Mapping):
         raise TypeError(f"render: expected a mapping with results, trials, objects …, got {type(data).__name__}")
@@ -29,9 +40,15 @@ def render(data: Mapping[str, Any]) -> str:
     results: dict[str, Any] = found if isinstance(found, dict) else {}
     run = summary.mapping(data.get("calibration"))
     known = calibration_table.section(results.get("calibration"), run)
-    drawn = known["figures"] if known else []
-    drawings = payload.encode({"figures": [_drawing(figure) for figure in drawn], "styles": calibration.styles()})
-    carried = payload.build(data, reserved=len(drawings) if drawn else 0)
+    searches = convergence.figures(data.get("plans"), results.get("plans"))
+    drawn = [*(known["figures"] if known else []), *(figure for figure in searches if figure["data"])]
+    for index, figure in enumerate(drawn):
+        figure["index"] = index
+    styles = {**calibration.styles(), **convergence.STYLES}
+    drawings = payload.encode({"figures": [_drawing(figure) for figure in drawn], "styles": styles})
+    shots = pictures.carried(_list(data.get("trials")), data.get("imagers"))
+    shown = payload.encode(shots) if any(shots["trials"]) or shots["imagers"] else ""
+    carried = payload.build(data, reserved=len(shown) + (len(drawings) if drawn else 0))
     carried["figures"] = [traces.figure(trial) for trial in carried["trials"]]
     carried["styles"] = traces.styles()
     plotted = any(figure is not None for figure in carried["figures"])
@@ -49,19 +66,27 @@ def render(data: Mapping[str, Any]) -> str:
         provenance=list(summary.leaves(provenance)) if provenance else [],
         log=summary.log_summary(data.get("log"), len(results.get("trials") or [])),
         events=summary.event_rows(data.get("events")),
+        searches=searches,
+        devices=device_health.section(data.get("health"), data.get("events")),
+        pictures=shown,
         trials=carried["trials"],
         playable=any(trial["playback"] is not None for trial in carried["trials"]),
         plotted=plotted,
         data=payload.encode(carried),
-        drawings=drawings,
+        drawings=drawings if drawn else "",
         style=_text("style.css"),
+        dark=_text("dark.css"),
         scripts={name: _text(name) for name in SCRIPTS},
         plotly=_plotly() if plotted or drawn else "",
     )
 
 
 def _drawing(figure: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: figure[key] for key in ("data", "layout", "wide")}
+    return {"data": figure["data"], "layout": figure["layout"], "wide": figure.get("wide", False)}
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
 
 
 def _text(name: str) -> str:

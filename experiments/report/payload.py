@@ -107,7 +107,10 @@ def _series(value: Any, count: int) -> dict[str, list[list[float] | None] | None
 
 
 def _contact(value: Any) -> list[Any] | None:
-    """[x, y, fx, fy, index of the mode, name]; an unknown mode is drawn as free, a missing force as none."""
+    """[x, y, fx, fy, index of the mode, name, nx, ny, µ]; an unknown mode is drawn as free, a missing force as none.
+
+    The normal and µ end the list where both are known, of planned contacts; the name where it has one.
+    """
     source = _mapping(value)
     point = _vector(source.get("point"), 2)
     if point is None:
@@ -115,7 +118,10 @@ def _contact(value: Any) -> list[Any] | None:
     mode = source.get("mode")
     index = MODES.index(mode) if mode in MODES else MODES.index("free")
     force = _vector(source.get("force"), 2) or [0.0, 0.0]
-    return [*point, *force, index, *([str(source["name"])] if source.get("name") else [])]
+    name, normal, mu = str(source.get("name") or ""), _vector(source.get("normal"), 2), _number(source.get("mu"))
+    if normal is not None and mu is not None and mu >= 0:
+        return [*point, *force, index, name, *normal, mu]
+    return [*point, *force, index, *([name] if name else [])]
 
 
 def _contacts(value: Any, count: int) -> list[list[list[Any]]]:

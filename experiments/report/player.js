@@ -9,7 +9,7 @@ const Player = (() => {
   const POSE = [["x", "mm", 1000, 2], ["y", "mm", 1000, 2], ["θ", "deg", 180 / Math.PI, 2]];
   const WRENCH = [["fx", "N", 1, 3], ["fy", "N", 1, 3], ["τ", "N·mm", 1000, 1]];
 
-  let trial = null, scene = null, compliance = null, cells = [], time = 0, playing = false, last = 0;
+  let trial = null, scene = null, compliance = null, cells = [], time = 0, kept = null, playing = false, last = 0;
 
   const format = (value, digits) => value === null ? "–" : Scene.number(value, digits);
   const span = () => trial.playback ? [trial.playback.t[0], trial.playback.t.at(-1)] : [0, 0];
@@ -109,7 +109,7 @@ const Player = (() => {
   const draw = () => {
     if (!trial.playback) return;
     const frame = frameAt(time), k = target(time), planned = plannedAt(k);
-    const options = { plan: $("show-plan").checked, forces: $("show-forces").checked };
+    const options = { plan: $("show-plan").checked, forces: $("show-forces").checked, cones: $("show-cones").checked };
     scene.draw(frame, planned, options);
     compliance.draw(frame, planned, options);
     drawContacts(frame.contacts);
@@ -127,11 +127,20 @@ const Player = (() => {
     for (const listener of listeners.time) listener(time);
   };
 
-  const seek = (t) => {
+  const move = (t) => {
     const [start, end] = span();
     time = Math.min(end, Math.max(start, t));
     draw();
   };
+  const seek = (t) => { kept = null; move(t); };
+
+  // A look at another instant, from which `release` leads back; while it plays, nothing does.
+  const preview = (t) => {
+    if (playing || !trial.playback) return;
+    kept ??= time;
+    move(t);
+  };
+  const release = () => { if (kept !== null) seek(kept); };
 
   const play = (on) => {
     if (on && !trial.playback) return;
@@ -167,6 +176,7 @@ const Player = (() => {
   const choose = (index) => {
     play(false);
     trial = data.trials[index];
+    $("trial-name").textContent = trial.name;
     $("trial-facts").textContent = [trial.skill, trial.controller, trial.status].filter(Boolean).map((w) => w.replaceAll("_", " ")).join(" · ")
       + (trial.reason ? `: ${trial.reason}` : "");
     $("stage").hidden = !trial.playback;
@@ -201,11 +211,12 @@ const Player = (() => {
   $("previous").addEventListener("click", () => toWaypoint(-1));
   $("next").addEventListener("click", () => toWaypoint(1));
   $("trial").addEventListener("change", () => choose(Number($("trial").value)));
-  for (const id of ["show-plan", "show-forces"]) $(id).addEventListener("change", draw);
+  for (const id of ["show-plan", "show-forces", "show-cones"]) $(id).addEventListener("change", draw);
 
   choose(0);
+  performance.mark("interactive");  // slider, keys and scene answer from here on
   return {
-    data, seek, choose,
+    data, seek, preview, release, choose,
     on: (what, listener) => listeners[what].push(listener),
     get time() { return time; },
     get index() { return data.trials.indexOf(trial); },

@@ -4,7 +4,7 @@
 // is started when a figure comes near the screen, or goes to paper.
 const Plots = (() => {
   const CONFIG = { displaylogo: false, responsive: true, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
-  const SHADES = { recorded: "ink", stiffness: "ink", interval: "fitted", cone: "fitted" };  // others have their own
+  const SHADES = { recorded: "ink", loss: "measured", stiffness: "ink", interval: "fitted", cone: "fitted" };  // others have their own
   let started = false;
 
   const shade = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
@@ -53,7 +53,7 @@ const Plots = (() => {
 
   // Colours follow the scheme, widths the paper.
   const follow = (redraw, toPaper) => {
-    for (const query of ["(prefers-color-scheme: dark)", "print"]) matchMedia(query).addEventListener("change", redraw);
+    Theme.follow(redraw);
     addEventListener("beforeprint", toPaper);
     addEventListener("afterprint", redraw);
   };

@@ -149,6 +149,19 @@ const Scene = (() => {
       el("path", { class: "arrow wrench", d: tip }, over);
     };
 
+    // The cone that the plan believed in, at the contact that it is of; where nothing touches, where the plan has it.
+    const NEAR = 0.015, LONG = 52;  // [m], [px]
+    const drawCones = (contacts, plan) => {
+      for (const [x, y, , , , , nx, ny, mu] of (plan || []).filter((c) => c.length > 8)) {
+        const away = (c) => Math.hypot(c[0] - x, c[1] - y);
+        const touching = contacts.filter((c) => away(c) < NEAR).sort((a, b) => away(a) - away(b))[0];
+        const [cx, cy] = touching ? px(touching[0], touching[1]) : px(x, y), half = Math.atan(mu);
+        const way = Math.atan2(ny, nx) + (touching && touching[2] * nx + touching[3] * ny < 0 ? Math.PI : 0);
+        const at = (angle) => `${(cx + LONG * Math.cos(angle)).toFixed(2)} ${(cy - LONG * Math.sin(angle)).toFixed(2)}`;
+        el("path", { class: "cone", d: `M${cx.toFixed(2)} ${cy.toFixed(2)}L${at(way - half)}A${LONG} ${LONG} 0 0 0 ${at(way + half)}Z` }, over);
+      }
+    };
+
     const draw = (frame, planned, options) => {
       for (const body of ["go", "eo", "ee"]) {
         place(parts[body], frame[body]);
@@ -166,6 +179,7 @@ const Scene = (() => {
       }
       membrane.setAttribute("d", spokes);
       over.replaceChildren();
+      if (options.cones) drawCones(frame.contacts, planned?.contacts);
       if (options.forces) {
         if (options.plan) for (const c of planned?.contacts || []) drawForce(...px(c[0], c[1]), c[2], c[3], "planned");
         for (const c of frame.contacts) drawForce(...px(c[0], c[1]), c[2], c[3], "contact");

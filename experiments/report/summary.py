@@ -114,7 +114,7 @@ def _git(value: Any) -> str:
 
 
 def error_table(results: Mapping[str, Any], paper: Any = None) -> dict[str, Any]:
-    """Rows of the error tables; ``heads`` and ``sources`` name only what some trial has.
+    """Rows of the error tables; ``heads``, ``sources`` and ``component_sources`` name only what some trial has.
 
     ``paper`` may hold ``{"source": text, "rows": {trial name: M}}``: figures of the paper to show beside.
     Each row's ``aggregates[key][source]`` and ``components[source][key]`` is (mean, std) as text, or None.
@@ -124,8 +124,9 @@ def error_table(results: Mapping[str, Any], paper: Any = None) -> dict[str, Any]
         {"measured": trial.get("measured"), "truth": trial.get("truth"), "paper": beside.get(str(trial.get("name")))}
         for trial in trials
     ]
-    sources = [s for s in SOURCES if s != "paper" or any(f["paper"] for f in figures)]
+    component_sources = _told(figures, [c[0] for c in COMPONENTS])
     heads = [h for h in AGGREGATES if h[0] != "eo_pose_mm" or any(_has(f, h[0]) for f in figures)]
+    sources = _told(figures, [h[0] for h in heads])
     rows = []
     for trial, figure in zip(trials, figures, strict=True):
         status = trial.get("status")
@@ -137,11 +138,19 @@ def error_table(results: Mapping[str, Any], paper: Any = None) -> dict[str, Any]
             "level": level(status),
             "reason": "; ".join(filter(None, (str(trial.get("reason") or ""), finger_slip(trial)))),
             "aggregates": {h[0]: {s: _figure(figure[s], h[0], h[3]) for s in sources} for h in heads},
-            "components": {s: {c[0]: _figure(figure[s], c[0], c[3]) for c in COMPONENTS} for s in sources},
+            "components": {s: {c[0]: _figure(figure[s], c[0], c[3]) for c in COMPONENTS} for s in component_sources},
         }
         rows.append(row)
     source = str(mapping(paper).get("source") or "the paper")
-    return {"heads": heads, "components": COMPONENTS, "sources": sources, "rows": rows, "paper": source}
+    return {
+        **{"heads": heads, "sources": sources, "components": COMPONENTS, "component_sources": component_sources},
+        **{"rows": rows, "paper": source},
+    }
+
+
+def _told(figures: list[dict[str, Any]], keys: list[str]) -> list[str]:
+    """The sources to show: the paper only where it has one of these figures."""
+    return [s for s in SOURCES if s != "paper" or any(_has({s: f[s]}, key) for f in figures for key in keys)]
 
 
 def _has(figure: Mapping[str, Any], key: str) -> bool:
@@ -151,13 +160,19 @@ def _has(figure: Mapping[str, Any], key: str) -> bool:
 def _figure(values: Any, key: str, decimals: int) -> tuple[str, str | None] | None:
     entry = mapping(mapping(values).get(key))
     mean, std = entry.get("mean"), entry.get("std")
-    if not _is_number(mean):
+    if not is_number(mean):
         return None
-    return f"{mean:.{decimals}f}", f"{std:.{decimals}f}" if _is_number(std) else None
+    return f"{mean:.{decimals}f}", f"{std:.{decimals}f}" if is_number(std) else None
 
 
-def _is_number(value: Any) -> TypeGuard[int | float]:
+def is_number(value: Any) -> TypeGuard[int | float]:
+    """Whether ``value`` is a figure, which a truth value is not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def duration(seconds: float) -> str:
+    """A time [s] to three digits, with its unit."""
+    return f"{seconds * 1e3:.3g} ms" if abs(seconds) < 1 else f"{seconds:.3g} s"
 
 
 def log_summary(log: Any, trials: int) -> dict[str, Any] | None:
@@ -170,8 +185,8 @@ def log_summary(log: Any, trials: int) -> dict[str, Any] | None:
     ending = str(source.get("ending") or ("the end is missing" if source.get("torn") else "complete"))
     if not source or not (source.get("bytes") or source.get("messages")):
         return None
-    counts = {str(k): int(v) for k, v in mapping(source.get("messages")).items() if _is_number(v)}
-    seconds, size, lost = (v if _is_number(v := source.get(key)) else None for key in ("seconds", "bytes", "lost"))
+    counts = {str(k): int(v) for k, v in mapping(source.get("messages")).items() if is_number(v)}
+    seconds, size, lost = (v if is_number(v := source.get(key)) else None for key in ("seconds", "bytes", "lost"))
     return {
         "file": str(source.get("file") or "log.mcap"),
         "total": f"{sum(counts.values()):,}",
@@ -193,7 +208,7 @@ def event_rows(events: Any) -> list[dict[str, str]]:
         severity = str(source.get("level") or "info")
         rows.append(
             {
-                "t": f"{t:.2f}" if _is_number(t) else "–",
+                "t": f"{t:.2f}" if is_number(t) else "–",
                 "level": severity if severity in ("info", "warning", "error") else "info",
                 "text": str(source.get("text") or ""),
             }

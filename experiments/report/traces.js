@@ -46,6 +46,8 @@
     if (!drawn) {
       drawn = true;
       holder.on("plotly_click", (event) => Player.seek(event.points[0].x));
+      holder.on("plotly_hover", (event) => Player.preview(event.points[0].x));
+      holder.on("plotly_unhover", () => Player.release());
       holder.on("plotly_relayout", moveCursors);
     }
     moveCursors();

@@ -53,7 +53,8 @@ class Objective(Protocol):
 class Optimum:
     """What an optimiser found: ``z`` (K, D) with the least loss ``value`` that it saw, the ``curve`` of the loss per
     iteration, how often it asked for a whole trajectory (``queries``), and how it ended (``converged``, ``iterations``
-    for a spent budget, ``stalled``)."""
+    for a spent budget, ``stalled``). ``asked``, as long as the curve, is how often it had asked by each of its entries;
+    empty where that is not known."""
 
     z: Array
     value: float
@@ -61,6 +62,7 @@ class Optimum:
     queries: int
     time_s: float
     status: str = "iterations"
+    asked: tuple[int, ...] = ()
 
 
 @dataclass

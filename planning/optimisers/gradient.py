@@ -91,4 +91,6 @@ class Gradient(Optimiser):
         best, curve = own(z, *settings) if own else adam(objective, z, *settings)
         elapsed = time.perf_counter() - began
         require_finite(self.name, float(curve[0]))
-        return Optimum(best, float(np.min(curve)), curve, self.iterations, elapsed)
+        return Optimum(
+            best, float(np.min(curve)), curve, self.iterations, elapsed, asked=tuple(range(1, self.iterations + 1))
+        )

@@ -99,7 +99,7 @@ class ICEM(Optimiser):
         mean, deviation = start, np.where(objective.free, self.sigma, 0.0)
         kept, kept_losses = np.empty((0, *mean.shape)), np.empty(0)
         keep = max(1, int(self.reuse * self.elite_count)) if self.reuse > 0 else 0
-        curve, queries, sizes = [], 0, self.sizes
+        curve, asked, queries, sizes = [], [], 0, self.sizes
         old = self.momentum if self.momentum is not None else 0.5 if self._few else 0.1
         best, least = start, np.inf
         for i, count in enumerate(sizes):
@@ -129,9 +129,10 @@ class ICEM(Optimiser):
                 mean = (1 - old) * elites.mean(axis=0) + old * mean
                 deviation = (1 - old) * elites.std(axis=0) + old * deviation
             curve.append(least)
+            asked.append(queries)
         if self.warm is not None:
             self.warm.z = kept
-        return Optimum(best, least, np.array(curve), queries, time.perf_counter() - began)
+        return Optimum(best, least, np.array(curve), queries, time.perf_counter() - began, asked=tuple(asked))
 
     def _shifted(self, start: Array, free: NDArray[np.bool_], trials: Array) -> Array:
         """The last call's elites (E, K, D), moved on by ``shift`` steps; their last steps are those of ``trials``."""

@@ -98,7 +98,7 @@ class LevenbergMarquardt(Optimiser):
         flat = self.gradient_tolerance * _largest(model.gradient, free)
         warm = self.warm or Warm()
         damping = self.damping if warm.damping is None else warm.damping
-        growth, curve, queries, misjudged = 2.0, [model.value], 1, 0
+        growth, curve, asked, queries, misjudged = 2.0, [model.value], [1], 1, 0
         rest = warm.curvature
         if rest is not None and rest.diagonal.shape != model.diagonal.shape:
             rest = None
@@ -135,14 +135,15 @@ class LevenbergMarquardt(Optimiser):
             else:
                 damping, growth = damping * growth, 2 * growth
             curve.append(model.value)
+            asked.append(queries)
             misjudged += not 0.5 < gain < 1.5
             if self.exact and misjudged >= MISJUDGED and not known_here:
-                rest, asked = curvature(objective, z, model)
-                queries += asked
+                rest, gradients = curvature(objective, z, model)
+                queries += gradients
                 misjudged, known_here = MISJUDGED - 1, True
                 warm.curvature, H = rest, _hessian(model, rest)
         warm.damping = min(damping, LARGEST_HANDED_ON)
-        return Optimum(z, model.value, np.array(curve), queries, time.perf_counter() - began, status)
+        return Optimum(z, model.value, np.array(curve), queries, time.perf_counter() - began, status, tuple(asked))
 
 
 def curvature(objective: Objective, z: Array, model: Quadratic) -> tuple[Curvature, int]:

@@ -91,7 +91,7 @@ class MPPI(Optimiser):
         mean = checked_start(self.name, objective, z)
         began = time.perf_counter()
         sigma = np.where(objective.free, self.sigma, 0.0)
-        best, least, queries, curve = mean, np.inf, 0, []
+        best, least, queries, curve, asked = mean, np.inf, 0, [], []
         for i in range(self.iterations):
             last = i == self.iterations - 1
             count = self.samples - last
@@ -116,4 +116,5 @@ class MPPI(Optimiser):
                 if value < least:
                     best, least = mean, value
             curve.append(least)
-        return Optimum(best, least, np.array(curve), queries, time.perf_counter() - began)
+            asked.append(queries)
+        return Optimum(best, least, np.array(curve), queries, time.perf_counter() - began, asked=tuple(asked))

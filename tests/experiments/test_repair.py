@@ -15,7 +15,8 @@ from drivers.errors import DeviceFault
 from drivers.wire.log import LogWriter
 from drivers.wire.log_reader import LogReader
 from experiments.repair import repair
-from experiments.report.collect import collect, read_logs
+from experiments.report.collect import collect
+from experiments.report.logged import read_logs
 from experiments.run_folder import RunFolder
 from experiments.run_lock import RunLock
 from mechanics.records import TrialRecord

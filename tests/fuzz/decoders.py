@@ -46,7 +46,8 @@ from experiments.calibrate.models import (
 )
 from experiments.calibrate.samples import load_samples
 from experiments.campaign.frame import cells, trials_frame
-from experiments.report.collect import LoggedTrial, collect, plan_of
+from experiments.report.collect import collect, plan_of
+from experiments.report.logged import LoggedTrial
 from experiments.report.page import render
 from experiments.run_folder import RunFolder
 from experiments.schema import Experiment

@@ -184,6 +184,7 @@ def test_provenance_says_how_the_plan_came_about(task_of):
     assert told["optimiser"] == {"name": "gradient", "iterations": 7, "rate": 0.2, "betas": [0.9, 0.999], "eps": 1e-8}
     assert (told["objective"], told["form"], told["ended"]) == ("FusedObjective", "closed", "iterations")
     assert len(told["curve"]) == 7
+    assert told["curve_queries"] == [1, 2, 3, 4, 5, 6, 7]
     assert math.isclose(min(told["curve"]), p.loss, rel_tol=1e-9)
     assert math.isclose(sum(told["terms"].values()), p.loss, rel_tol=1e-9)
     # 3 N straight down less 2 N, at µ = 0.33: 0.33 N of distance to the edge over √(1 + µ²)

@@ -1,52 +1,18 @@
 """The page in a browser: it is quiet, it asks for nothing, it moves, and what it shows are the numbers it was given."""
 
 import math
-import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments.report import render
-
-CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    # `make` installs it where it may; elsewhere a system package of 300 MB must not keep the other tests from running
-    if not Path(CHROMIUM).exists():
-        pytest.skip(f"no chromium at {CHROMIUM}; on Debian: apt-get install chromium")
-    arguments = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def show(browser, tmp_path_factory):
-    """Open the report of a run from disk, off line; what it complains of and asks for is in ``page.heard``."""
-    contexts = []
-
-    def open_report(run, width=1280, scheme="light"):
-        path = tmp_path_factory.mktemp("report") / "report.html"
-        path.write_text(render(run), encoding="utf-8")
-        context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, offline=True)
-        context.set_default_timeout(30_000)
-        contexts.append(context)
-        page = context.new_page()
-        page.heard = []
-        page.on("console", lambda message: page.heard.append(f"{message.type}: {message.text}"))
-        page.on("pageerror", lambda error: page.heard.append(f"error: {error}"))
-        page.on("request", lambda request: request.url == path.as_uri() or page.heard.append(f"request: {request.url}"))
-        page.goto(path.as_uri())
-        return page
-
-    yield open_report
-    for context in contexts:
-        context.close()
+from tests.experiments.report.pages import (
+    draw_calibrations,
+    draw_traces,
+    expect_pose,
+    pose,
+    seek,
+    wait_until,
+)
 
 
 @pytest.fixture(scope="module")
@@ -60,38 +26,6 @@ def traced(show, grasped):
     page = show(grasped)
     draw_traces(page)
     return page
-
-
-def seek(page, t):
-    """Move the slider as a hand would: set it and let it tell."""
-    page.locator("#time").evaluate("(slider, t) => { slider.value = t; slider.dispatchEvent(new Event('input')); }", t)
-
-
-def draw_traces(page):
-    page.locator("#traces-title").scroll_into_view_if_needed()
-    page.wait_for_selector("#traces .scatterlayer .trace")
-
-
-def wait_until(page, condition):
-    """Wait for a condition on the page, looked at once per frame."""
-    page.evaluate(
-        f"new Promise((done) => {{ const look = () => ({condition}) ? done() : requestAnimationFrame(look); look(); }})"
-    )
-
-
-def pose(page, body):
-    """[x, y, θ in degrees] of a drawn body, and None where it is not shown."""
-    node = page.locator(f".body-{body}")
-    if not node.is_visible():
-        return None
-    text = node.get_attribute("transform")
-    return [
-        float(v) for part in text.replace(")", "").split(" rotate(") for v in part.replace("translate(", "").split()
-    ]
-
-
-def expect_pose(page, body, wanted):
-    assert pose(page, body) == pytest.approx([wanted[0], wanted[1], math.degrees(wanted[2])], abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -117,12 +51,6 @@ def test_the_page_is_quiet_asks_for_nothing_and_fits(request, show, name, width,
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     for table in page.locator(".scroll").all():
         assert table.evaluate("box => box.scrollWidth - box.clientWidth") <= 1, table.inner_text()
-
-
-def draw_calibrations(page):
-    for plot in page.locator(".calibration-plot").all():
-        plot.scroll_into_view_if_needed()
-        plot.locator(".scatterlayer .trace").first.wait_for(state="attached")
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (800, "dark")])

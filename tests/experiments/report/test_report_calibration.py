@@ -23,7 +23,7 @@ def model(kind, run, name):
 
 def drawn(page):
     """What the page carries of calibration figures."""
-    text = re.search(r'<script type="application/json" id="calibration-data">(.*?)</script>', page, re.DOTALL)
+    text = re.search(r'<script type="application/json" id="drawings">(.*?)</script>', page, re.DOTALL)
     return json.loads(text.group(1))["figures"] if text else []
 
 
@@ -184,7 +184,7 @@ def test_every_calibration_is_a_row_with_its_file_and_date(calibrated, find_cell
 def test_a_calibration_that_was_only_used_is_a_row_without_a_figure(grasped, find_cells):
     page = render(grasped)
     assert find_cells(page, "calibrations")[0][3] == "2025-11-20 08:15 UTC run calibrate-20251120T080000"
-    assert 'id="calibration-data"' not in page
+    assert 'class="calibration-plot"' not in page
     assert "could not be drawn" not in page
 
 

@@ -137,7 +137,7 @@ def test_empty_run_says_what_there_is_not(empty):
     page = render(empty)
     for words in ("No trial was executed", "nothing to play back", "no traces", "no log", "No event"):
         assert words in page
-    assert "<script" not in page
+    assert page.count("<script") == 1  # the theme's
     assert len(page) < 100_000
 
 
@@ -343,13 +343,13 @@ def contrast(a, b):
     return (high + 0.05) / (low + 0.05)
 
 
-@pytest.mark.parametrize("scheme", [0, 1], ids=["light", "dark"])
+@pytest.mark.parametrize("scheme", ["style.css", "dark.css"], ids=["light", "dark"])
 def test_colours_meet_wcag_contrast(scheme):
-    css = (files("experiments.report") / "style.css").read_text()
-    block = re.findall(r":root \{(.*?)\}", css, re.DOTALL)[scheme]
+    css = (files("experiments.report") / scheme).read_text()
+    block = re.findall(r":root \{(.*?)\}", css, re.DOTALL)[0]
     colours = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6})", block))
     for name in ("ink", "muted", "link", "completed", "short", "aborted"):  # text: AA
-        assert contrast(colours[name], colours["page"]) >= 4.5, name
+        assert contrast(colours[name], colours["page"]) >= 4.5, name  # the page's and, of a control, the panel's ground
         assert contrast(colours[name], colours["panel"]) >= 4.5, name
     for name in ("stick", "slip", "free", "wrench", "planned", "measured", "truth", "finger", "ground"):  # graphics
         assert contrast(colours[name], colours["page"]) >= 3.0, name

@@ -1,11 +1,11 @@
 "use strict";
 
-// The figures of the calibrations that the run made, each drawn when it comes near the screen.
+// The figures beside the traces: how plans were found, what was calibrated. Each is drawn when it comes near the screen.
 (() => {
-  const { figures, styles } = JSON.parse(document.getElementById("calibration-data").textContent);
+  const { figures, styles } = JSON.parse(document.getElementById("drawings").textContent);
   const PAPER = { wide: 680, narrow: 330 };  // whole and half the width between the margins of an A4 page [px]
 
-  for (const holder of document.querySelectorAll(".calibration-plot")) {
+  for (const holder of document.querySelectorAll("[data-figure]")) {
     const figure = figures[Number(holder.dataset.figure)];
     let drawn = false;
     const draw = (width) => {
