@@ -29,7 +29,11 @@ def plotly() -> str:
 
 @cache
 def environment() -> Environment:
-    """What fills templates in: everything escaped, and a name that is missing is an error."""
-    from jinja2 import Environment, StrictUndefined
+    """What fills templates in: everything escaped, and a name that is missing is an error.
 
-    return Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    A template is named by its path within `experiments`.
+    """
+    from jinja2 import Environment, FunctionLoader, StrictUndefined
+
+    settings = {"autoescape": True, "undefined": StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    return Environment(loader=FunctionLoader(lambda name: text("experiments", name)), **settings)

@@ -22,8 +22,7 @@ def render(collected: Collected) -> str:
         )
         if figure is not None
     }
-    template = parts.environment().from_string(parts.text(HERE, "template.html.j2"))
-    return template.render(
+    return parts.environment().get_template("campaign/report/template.html.j2").render(
         title=f"Sweep of {collected.summary.get('experiment') or 'an experiment'}",
         verdict=tables.verdict(collected),
         facts=tables.facts(collected),
@@ -38,8 +37,13 @@ def render(collected: Collected) -> str:
         provenance=list(tables.provenance_rows(collected)),
         figures=figures,
         data=payload.encode(payload.clean(figures)),
-        style=parts.text(parts.HERE, "style.css") + parts.text(HERE, "campaign.css"),
+        style=style(),
         plots=parts.text(parts.HERE, "plots.js"),
         script=parts.text(HERE, "points.js"),
         plotly=parts.plotly() if figures else "",
     )
+
+
+def style() -> str:
+    """The run's style, and what a campaign's page has besides."""
+    return parts.text(parts.HERE, "style.css") + parts.text(HERE, "campaign.css")
