@@ -22,25 +22,29 @@ def render(collected: Collected) -> str:
         )
         if figure is not None
     }
-    return parts.environment().get_template("campaign/report/template.html.j2").render(
-        title=f"Sweep of {collected.summary.get('experiment') or 'an experiment'}",
-        verdict=tables.verdict(collected),
-        facts=tables.facts(collected),
-        warnings=tables.warnings(collected),
-        missing=collected.missing,
-        given_up=collected.given_up,
-        cells=tables.cell_rows(collected),
-        differences=tables.difference_rows(collected),
-        failures=tables.failure_rows(collected),
-        worst=tables.worst(collected),
-        trials=tables.trial_rows(collected),
-        provenance=list(tables.provenance_rows(collected)),
-        figures=figures,
-        data=payload.encode(payload.clean(figures)),
-        style=style(),
-        plots=parts.text(parts.HERE, "plots.js"),
-        script=parts.text(HERE, "points.js"),
-        plotly=parts.plotly() if figures else "",
+    return (
+        parts.environment()
+        .get_template("campaign/report/template.html.j2")
+        .render(
+            title=f"Sweep of {collected.summary.get('experiment') or 'an experiment'}",
+            verdict=tables.verdict(collected),
+            facts=tables.facts(collected),
+            warnings=tables.warnings(collected),
+            missing=collected.missing,
+            given_up=collected.given_up,
+            cells=tables.cell_rows(collected),
+            differences=tables.difference_rows(collected),
+            failures=tables.failure_rows(collected),
+            worst=tables.worst(collected),
+            trials=tables.trial_rows(collected),
+            provenance=list(tables.provenance_rows(collected)),
+            figures=figures,
+            data=payload.encode(payload.clean(figures)),
+            style=style(),
+            plots=parts.text(parts.HERE, "plots.js"),
+            script=parts.text(HERE, "points.js"),
+            plotly=parts.plotly() if figures else "",
+        )
     )
 
 
