@@ -16,14 +16,15 @@
   };
   const chosen = (name) => document.querySelector(`input[name="source-${name}"]:checked`)?.value;
 
-  // Where each row of a page stands, from the top, in rows; and where each cell's name does.
-  const places = (page, size) => {
+  // Where each row of a page stands, from the top, in rows; and where each cell does, with a row for its name if need be.
+  const places = (page, size, named) => {
     const rows = [], cells = [];
     let y = 0;
     for (const group of page.groups) {
       if (!cells.length || cells.at(-1).name !== group.cell) {
         if (cells.length) y += size.gap / size.row;
         cells.push({ name: group.cell, from: y, to: y });
+        if (named) y += 1;
       }
       rows.push(y + 0.5);
       y += 1;
@@ -94,20 +95,22 @@
 
   const figureOf = (name, number) => {
     const figure = figures[name], page = figure.pages[number], source = chosen(name) || figure.sources[0];
-    const { rows, cells, end } = places(page, figure.size), { top, bottom } = figure.size;
+    const { rows, cells, end } = places(page, figure.size, figure.named), { top, bottom } = figure.size;
     const count = figure.quantities.length, width = (1 - COLUMN_GAP * (count - 1)) / count;
+    const ticks = figure.named
+      ? { tickvals: rows, ticktext: page.groups.map((group) => label(group.series)) }
+      : { tickvals: cells.map(({ from, to }) => (from + to) / 2), ticktext: cells.map((cell) => label(cell.name)) };
     const half = figure.size.gap / figure.size.row / 2;
     const layout = {
       height: page.height, margin: { l: 10, r: 10, t: top, b: bottom }, hovermode: "closest", dragmode: "zoom",
-      legend: { orientation: "h", x: 0, y: 1, yanchor: "top", yref: "container" }, annotations: [], shapes: [],
+      showlegend: !figure.named, legend: { orientation: "h", x: 0, y: 1, yanchor: "top", yref: "container" }, annotations: [], shapes: [],
     };
     figure.quantities.forEach(({ key, head, unit }, i) => {
       const id = i ? String(i + 1) : "", across = [i * (width + COLUMN_GAP), i * (width + COLUMN_GAP) + width];
       layout[`xaxis${id}`] = { domain: across, anchor: `y${id}`, range: limits(figure, source, key) };
       layout[`yaxis${id}`] = {
         anchor: `x${id}`, range: [end + half, -half], ...(i ? { matches: "y" } : {}), showticklabels: i === 0, automargin: true,
-        tickmode: "array", tickvals: cells.map(({ from, to }) => (from + to) / 2), ticktext: cells.map((cell) => label(cell.name)),
-        fixedrange: true,
+        tickmode: "array", ...ticks, fixedrange: true,
       };
       layout.annotations.push({
         text: `${head} [${unit}]`, x: across[0], y: 1, xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom",
@@ -124,6 +127,10 @@
     if (figure.keys) layout.annotations.push({
       text: plain(figure.keys), x: 0, y: 0, xref: "paper", yref: "paper", xanchor: "left", yanchor: "top", yshift: -24, showarrow: false,
       font: { size: 12 },
+    });
+    if (figure.named) for (const { name, from } of cells) layout.annotations.push({
+      text: plain(name), x: 0, y: from + 0.5, xref: "paper", yref: "y", xanchor: "left", yanchor: "middle", showarrow: false,
+      font: { size: 12, weight: 600 },
     });
     const themed = Plots.layout(layout);
     for (const key of Plots.numbered(themed, "y")) Object.assign(themed[key], { showgrid: false, showline: false });

@@ -33,6 +33,9 @@ MOST_POINTS = 20_000
 ROWS = 48
 #: a row, what lies between cells, and the margins [px]
 ROW, GAP, TOP, BOTTOM = 26, 14, 66, 48
+#: so many letters has a legend of two lines at 800 px; of more methods each row says its own, below its cell's name
+LEGEND = 110
+_ENTRY = 8
 #: as the Parquet file has them, to what a screen can show
 _DIGITS = 6
 
@@ -68,8 +71,12 @@ def method(of: Mapping[str, Any], several: bool) -> str:
 
 
 def several_skills(collected: Collected) -> bool:
-    """Whether a method has to be told with its skill."""
-    return len(set(map(str, collected.trials["skill"].tolist()))) > 1
+    """Whether a method has to be told with its skill: where a cell has several."""
+    if not len(collected.trials):
+        return False
+    trials = collected.trials.assign(skill=[str(skill) for skill in collected.trials["skill"].tolist()])
+    cells = trials.groupby(list(collected.keys), dropna=False) if collected.keys else [("", trials)]
+    return any(len(set(rows["skill"].tolist())) > 1 for _, rows in cells)
 
 
 def distributions(collected: Collected) -> dict[str, Any] | None:
@@ -161,6 +168,7 @@ def _figure(
         return None
     names = list(dict.fromkeys(group["series"] for group in found))
     looks = {name: LOOKS[n % len(LOOKS)] for n, name in enumerate(names)}
+    named = sum(len(name) + _ENTRY for name in names) > LEGEND
     cells: dict[str, list[dict[str, Any]]] = {}
     for group in found:
         cells.setdefault(group["cell"], []).append(group)
@@ -177,12 +185,14 @@ def _figure(
         "step": step,
         "zero": zero,
         "size": {"row": ROW, "gap": GAP, "top": TOP, "bottom": BOTTOM},
-        "pages": [{"height": _height(page), "groups": page} for page in pages],
+        "named": named,
+        "pages": [{"height": _height(page, named), "groups": page} for page in pages],
     }
 
 
-def _height(page: Sequence[Mapping[str, Any]]) -> int:
-    return TOP + BOTTOM + ROW * len(page) + GAP * len({group["cell"] for group in page})
+def _height(page: Sequence[Mapping[str, Any]], named: bool) -> int:
+    cells = len({group["cell"] for group in page})
+    return TOP + BOTTOM + ROW * (len(page) + (cells if named else 0)) + GAP * cells
 
 
 def _rounded(value: float | None) -> float | None:
