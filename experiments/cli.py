@@ -17,6 +17,7 @@ from experiments.command import (
     Experiment,
     JsonFile,
     Run,
+    RunOrSweep,
     Scheduler,
     Sets,
     StationOption,
@@ -127,13 +128,21 @@ def check(experiment: Experiment, station: StationOption = None, sets: Sets = No
 
 @command("extrinsic report runs/grasped_pivoting-20260101T120000.000000")
 def report(
-    run_folder: Run,
+    run_folder: RunOrSweep,
 ) -> None:
-    """Rebuild a run's report from its log."""
+    """Rebuild a run's report from its log, or a sweep's from its jobs."""
+    from experiments.campaign.folder import is_campaign
     from experiments.progress import Progress
     from experiments.report.build import build_report
     from experiments.run_folder import RunFolder
 
+    if is_campaign(run_folder):
+        from experiments.campaign.report.build import rebuild
+
+        with Progress(terminal(stderr=True)).share("make the report"):
+            path = rebuild(run_folder)
+        terminal().print(f"report: {path}", soft_wrap=True, highlight=False)
+        return
     folder = RunFolder.open(run_folder)
     with Progress(terminal(stderr=True)).share("make the report") as heard:
         build_report(folder, heard)

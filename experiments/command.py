@@ -37,6 +37,10 @@ StationOption = Annotated[
     ),
 ]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.", autocompletion=completion.runs)]
+RunOrSweep = Annotated[
+    Path,
+    typer.Argument(metavar="RUN", help="A run folder, or a sweep's.", autocompletion=completion.runs_and_sweeps),
+]
 Sets = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Set a key of the experiment or the station; may be repeated."),

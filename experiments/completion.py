@@ -40,7 +40,16 @@ def benchmarks(incomplete: str) -> Completed:
 
 def runs(incomplete: str) -> Completed:
     """The newest run folders under ``runs/``."""
-    found = {str(path.parent): "" for path in Path("runs").glob("*/experiment.yaml")}
+    return _newest(incomplete, "experiment.yaml")
+
+
+def runs_and_sweeps(incomplete: str) -> Completed:
+    """The newest run folders and sweeps' folders under ``runs/``."""
+    return _newest(incomplete, "experiment.yaml", "campaign.json")
+
+
+def _newest(incomplete: str, *marks: str) -> Completed:
+    found = {str(path.parent): "" for mark in marks for path in Path("runs").glob(f"*/{mark}")}
     newest = dict(sorted(found.items(), key=lambda item: item[0].rsplit("-", 1)[-1], reverse=True)[:_RUNS])
     return _beginning(incomplete, newest)
 

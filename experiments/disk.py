@@ -70,9 +70,10 @@ def require_writable(file: Path | None, option: str) -> None:
         raise InputError([Problem(str(file), None, option, wrong, expected)]) from None
 
 
-def not_kept(error: OSError, folder: Path) -> DeviceFault:
-    """What a campaign or a table ends with whose summary cannot be written."""
-    remedy = f"All that was run is in {folder}. Make room there, then start again with --out {folder}"
+def not_kept(error: OSError, folder: Path, again: str = "") -> DeviceFault:
+    """What a campaign or a table ends with whose summary cannot be written; ``again``: the command that writes it."""
+    again = again or f"start again with --out {folder}"
+    remedy = f"All that was run is in {folder}. Make room there, then {again}"
     return DeviceFault("disk", f"write {error.filename or folder}", error.strerror or str(error), remedy)
 
 

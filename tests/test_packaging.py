@@ -63,11 +63,29 @@ def test_the_extra_of_the_emulators_has_what_a_franka_needs():
     assert set(extras["franka"]) <= set(extras["emulators"])
 
 
-def test_the_citation_is_of_the_paper():
+def against_the_format(citation):
+    """Hold a file against the Citation File Format's own schema, which the checker brings along."""
+    check = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.citation-file-format", str(citation)]
+    return subprocess.run(check, cwd=ROOT, check=False, capture_output=True, text=True, timeout=60)
+
+
+def test_the_citation_is_valid_in_its_format(tmp_path):
+    pytest.importorskip("check_jsonschema", reason="check-jsonschema is not installed")
+    said = against_the_format(ROOT / "CITATION.cff")
+    assert said.returncode == 0, said.stdout + said.stderr
+    wrong = tmp_path / "CITATION.cff"
+    wrong.write_text((ROOT / "CITATION.cff").read_text("utf-8").replace("conference-paper", "talk"))
+    said = against_the_format(wrong)
+    assert said.returncode == 1
+    assert "'talk' is not one of" in said.stdout
+
+
+def test_the_citation_refers_to_the_paper():
     cited = read_yaml(ROOT / "CITATION.cff").data
-    assert {"cff-version", "message", "title", "authors"} <= set(cited)  # what the format asks for
     assert cited["license"] == PROJECT["project"]["license"]
-    paper = cited["preferred-citation"]
+    # `preferred-citation` would have the paper cited in place of the software, which its authors have not written
+    assert "preferred-citation" not in cited
+    [paper] = cited["references"]
     assert paper["title"] == TITLE
     assert [(author["given-names"], author["family-names"]) for author in paper["authors"]] == AUTHORS
     assert TITLE in re.sub(r"\s+", " ", (ROOT / "README.md").read_text("utf-8"))

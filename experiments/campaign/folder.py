@@ -28,6 +28,10 @@ ENDED = ("completed", "fell_short", "stopped", "infeasible")
 _RUN = re.compile(r"run(?:\.([1-9][0-9]{0,8}))?")
 
 
+#: what says which jobs a campaign has
+_TOLD = "campaign.json"
+
+
 class JobFolder:
     """``jobs/<id>/``: the experiment, frozen, and its runs ``run``, ``run.1``, … of which none is ever overwritten."""
 
@@ -106,12 +110,17 @@ class _Campaign(BaseModel):
     jobs: list[_Job]
 
 
+def is_campaign(path: Path) -> bool:
+    """Whether a campaign lies in a folder, and no run."""
+    return (path / _TOLD).is_file()
+
+
 class CampaignFolder:
     """``campaign.json`` with what the campaign is, and ``jobs/<id>/`` for each of its jobs."""
 
     def __init__(self, path: Path):
         self.path = path.absolute()
-        self.campaign = self.path / "campaign.json"
+        self.campaign = self.path / _TOLD
 
     def job(self, id: str) -> JobFolder:
         """The folder of a job."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -79,10 +80,10 @@ def cells(folder: Path, frame: pd.DataFrame) -> list[dict[str, Any]]:
 
     A trial's figure is its mean over the waypoints that it reached. Seeds are pooled.
     """
-    by = [*_cell_keys(folder, frame), *METHOD]
+    by = [*cell_keys(folder, frame), *METHOD]
     found: list[dict[str, Any]] = []
     for _, group in frame.groupby(by, sort=False, dropna=False):
-        cell = {key: _plain(group[key].iloc[0]) for key in by}
+        cell = {key: plain(group[key].iloc[0]) for key in by}
         completed = rate(group["status"].tolist().count("completed"), len(group))
         figures = {name: _over(group, f"measured.{name}.mean") for name in COLUMNS}
         found.append(
@@ -98,44 +99,67 @@ def cells(folder: Path, frame: pd.DataFrame) -> list[dict[str, Any]]:
     return found
 
 
-def comparisons(folder: Path, frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """For each cell of the grid, skill and pair of controllers: the mean of ``a`` − ``b`` in each error, and its 95 %
-    interval by Student's t, over the trials of one seed and number that both have.
+@dataclass(frozen=True)
+class Pairing:
+    """Two controllers ``a`` and ``b`` of one skill in one cell of the grid, with the rows of each by their pair.
 
-    Whatever two trials of one seed and number share, such as their grasp, is out of the difference.
+    A pair is the trials of one seed and number: whatever they share, such as their grasp, is out of their difference.
     """
-    keys = [*_cell_keys(folder, frame), "skill"]
+
+    cell: dict[str, Any]
+    skill: Any
+    a: str
+    b: str
+    rows_a: pd.DataFrame
+    rows_b: pd.DataFrame
+
+    def values(self, column: str) -> tuple[dict[Hashable, float], dict[Hashable, float]]:
+        """The known figures in a ``column`` of either, by their pair; none where nobody has the column."""
+        if column not in self.rows_a:
+            return {}, {}
+        a, b = (rows.dropna(subset=[column])[column].astype(float).to_dict() for rows in (self.rows_a, self.rows_b))
+        return a, b
+
+
+def pairings(folder: Path, frame: pd.DataFrame) -> Iterator[Pairing]:
+    """Every cell of the grid, skill and pair of controllers, the later one less the earlier."""
+    keys = [*cell_keys(folder, frame), "skill"]
     # the same trial of the same skill comes more than once where a run has several plans of it
     nth = frame.groupby(["job", *METHOD, "trial"], dropna=False).cumcount()
     frame = frame.assign(**{_PAIR: list(zip(frame["job"], frame["trial"], nth, strict=True))})
-    found: list[dict[str, Any]] = []
     for _, group in frame.groupby(keys, sort=False, dropna=False):
-        laws = dict(list(group.groupby("controller", sort=False)))
+        laws = {name: rows.set_index(_PAIR) for name, rows in group.groupby("controller", sort=False)}
         for b, a in combinations(laws, 2):
-            measured = {name: _difference(laws[a], laws[b], f"measured.{name}.mean") for name in COLUMNS}
-            if any(measured.values()):
-                cell = {key: _plain(group[key].iloc[0]) for key in keys}
-                skill = cell.pop("skill")
-                found.append({"cell": cell, "skill": skill, "a": a, "b": b, "measured": measured})
+            cell = {key: plain(group[key].iloc[0]) for key in keys}
+            yield Pairing(cell, cell.pop("skill"), str(a), str(b), laws[a], laws[b])
+
+
+def comparisons(folder: Path, frame: pd.DataFrame) -> list[dict[str, Any]]:
+    """For each of the `pairings`: the mean of ``a`` − ``b`` in each error, and its 95 % interval by Student's t, over
+    the pairs that both have a figure of.
+    """
+    found: list[dict[str, Any]] = []
+    for one in pairings(folder, frame):
+        measured = {name: _difference(*one.values(f"measured.{name}.mean")) for name in COLUMNS}
+        if any(measured.values()):
+            found.append({"cell": one.cell, "skill": one.skill, "a": one.a, "b": one.b, "measured": measured})
     return found
 
 
-def _difference(a: pd.DataFrame, b: pd.DataFrame, column: str) -> dict[str, Any] | None:
-    if column not in a:
-        return None
-    known = [side.dropna(subset=[column]).set_index(_PAIR)[column].astype(float).to_dict() for side in (a, b)]
-    found = paired_over(known[0], known[1])
+def _difference(a: Mapping[Hashable, float], b: Mapping[Hashable, float]) -> dict[str, Any] | None:
+    found = paired_over(a, b)
     return None if found is None else {"mean": found.mean, "low": found.low, "high": found.high, "n": found.n}
 
 
-def _cell_keys(folder: Path, frame: pd.DataFrame) -> list[str]:
+def cell_keys(folder: Path, frame: pd.DataFrame) -> list[str]:
     """The columns that tell the cells of the grid apart."""
     named = dict.fromkeys(key for job in CampaignFolder(folder).read()["jobs"] for key in job["tags"])
     keys = [column for key in named if (column := f"grid.{key}" if f"grid.{key}" in frame else key) in frame]
     return [key for key in keys if key != "seed"]
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """A value of a frame as JSON has it."""
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and np.isnan(value) else value
@@ -170,8 +194,8 @@ def summary_table(title: str, found: list[dict[str, Any]]) -> Table:
         success = cell["success"]
         share = f"{success['rate']:.0%} ({success['low']:.0%}–{success['high']:.0%})"
         table.add_row(
-            *(escape(_shown(cell["cell"][key])) for key in keys),
-            *(escape(_shown(cell[key])) for key in methods),
+            *(escape(shown(cell["cell"][key])) for key in keys),
+            *(escape(shown(cell[key])) for key in methods),
             str(cell["n"]),
             share,
             *(_figure(cell["measured"][name]) for name in figures),
@@ -195,8 +219,8 @@ def comparison_table(found: list[dict[str, Any]]) -> Table:
         table.add_column(escape(COLUMNS[name]), justify="right", no_wrap=True)
     for one in told:
         table.add_row(
-            *(escape(_shown(one["cell"][key])) for key in keys),
-            *(escape(_shown(one[key])) for key in skills),
+            *(escape(shown(one["cell"][key])) for key in keys),
+            *(escape(shown(one[key])) for key in skills),
             escape(f"{one['a']} − {one['b']}"),
             str(max(figure["n"] for figure in one["measured"].values() if figure)),
             *(_interval(one["measured"][name]) for name in figures),
@@ -210,7 +234,8 @@ def _interval(figure: Mapping[str, Any] | None) -> str:
     return f"{figure['mean']:+.3f}\n{figure['low']:+.3f}…{figure['high']:+.3f}"
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A tag's value as people read it."""
     return "–" if value is None else value if isinstance(value, str) else json.dumps(value)
 
 

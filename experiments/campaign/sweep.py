@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
-from pandas import DataFrame
 from rich.console import Console
 
 from drivers.errors import NotConnected
@@ -16,6 +14,8 @@ from experiments.campaign import frame
 from experiments.campaign.engine import run_jobs
 from experiments.campaign.folder import CampaignFolder
 from experiments.campaign.grid import parse_grid, parse_seeds, sweep_jobs
+from experiments.campaign.report.build import write_report
+from experiments.campaign.summary import summarise
 from experiments.exit_codes import ExitCode
 from experiments.json_output import write
 
@@ -71,7 +71,7 @@ def _conclude(folder: Path, code: ExitCode, json_file: Path | None, console: Con
     campaign = CampaignFolder(folder)
     if not campaign.campaign.is_file():
         return True  # it was interrupted before anything was started
-    summary, trials = _summary(campaign, code)
+    summary, trials = summarise(campaign, _STATUS[code])
     console.print(frame.summary_table(f"sweep of {summary['experiment']}", summary["cells"]))
     differences = frame.comparison_table(summary["comparisons"])
     if differences.row_count:
@@ -85,26 +85,10 @@ def _conclude(folder: Path, code: ExitCode, json_file: Path | None, console: Con
         said.print(str(disk.not_kept(error, folder)), style="red", highlight=False, markup=False, soft_wrap=True)
         return False
     console.print(f"trials: {folder / frame.TRIALS}", soft_wrap=True, highlight=False)
+    try:
+        report = write_report(campaign, summary, trials)
+    except Exception as error:  # the trials are run and their table is kept: say it and go on
+        said.print(f"the report could not be made: {error}\n  extrinsic report {folder}", style="yellow", markup=False)
+    else:
+        console.print(f"report: {report}", soft_wrap=True, highlight=False)
     return True
-
-
-def _summary(campaign: CampaignFolder, code: ExitCode) -> tuple[dict[str, Any], DataFrame]:
-    told, trials = campaign.read(), frame.trials_frame(campaign.path)
-    folders = {job["id"]: campaign.job(job["id"]) for job in told["jobs"]}
-    failed = [
-        {"id": job["id"], "tags": job["tags"], "reason": failure}
-        for job in told["jobs"]
-        if (failure := folders[job["id"]].failure) is not None
-    ]
-    summary = {
-        "schema": 1,
-        "status": _STATUS[code],
-        "experiment": told["experiment"],
-        "jobs": len(told["jobs"]),
-        "ended": sum(folder.ended() is not None for folder in folders.values()),
-        "failed": failed,
-        "trials": len(trials),
-        "cells": frame.cells(campaign.path, trials),
-        "comparisons": frame.comparisons(campaign.path, trials),
-    }
-    return summary, trials

@@ -11,6 +11,15 @@ from experiments.run_folder import RunFolder, write_atomic
 def build_report(folder: RunFolder, heard: Heard = unheard) -> None:
     """Write ``report.html`` from the log and the results of a run folder; ``heard`` as in `collect`.
 
-    Raises InputError.
+    A fault campaign, which is a run as well, has a page of its own. Raises InputError.
     """
-    write_atomic(folder.report, render(collect(folder, heard)))
+    from experiments.faults import report as faults
+
+    data = collect(folder, heard)
+    if faults.is_fault_campaign(data["results"]):
+        from experiments.files import load
+
+        page = faults.render(folder, load(str(folder.experiment)), data)
+    else:
+        page = render(data)
+    write_atomic(folder.report, page)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
-from importlib.resources import files
 from typing import Any
 
 from experiments.report import (
@@ -17,8 +15,9 @@ from experiments.report import (
     summary,
     traces,
 )
+from experiments.report.parts import HERE, environment, plotly, text
 
-SCRIPTS = ("theme.js", "paper.js", "scene.js", "pictures.js", "player.js", "plots.js", "traces.js", "figures.js")
+SCRIPTS = ("paper.js", "scene.js", "pictures.js", "player.js", "plots.js", "traces.js", "figures.js")
 
 
 def render(data: Mapping[str, Any]) -> str:
@@ -55,29 +54,33 @@ def render(data: Mapping[str, Any]) -> str:
     only_calibrates = bool(run.get("only")) and not carried["trials"] and not results.get("trials")
     made = run.get("made")
     provenance = results.get("provenance")
-    return _template().render(
-        title=str(data.get("title") or "Untitled run"),
-        verdict=summary.verdict(results, len(made) if only_calibrates and isinstance(made, list) else None),
-        facts=summary.facts(data),
-        table=summary.error_table(results, data.get("paper")),
-        plans=summary.plan_rows(results),
-        calibration=known,
-        only_calibrates=only_calibrates,
-        provenance=list(summary.leaves(provenance)) if provenance else [],
-        log=summary.log_summary(data.get("log"), len(results.get("trials") or [])),
-        events=summary.event_rows(data.get("events")),
-        searches=searches,
-        devices=device_health.section(data.get("health"), data.get("events")),
-        pictures=shown,
-        trials=carried["trials"],
-        playable=any(trial["playback"] is not None for trial in carried["trials"]),
-        plotted=plotted,
-        data=payload.encode(carried),
-        drawings=drawings if drawn else "",
-        style=_text("style.css"),
-        dark=_text("dark.css"),
-        scripts={name: _text(name) for name in SCRIPTS},
-        plotly=_plotly() if plotted or drawn else "",
+    return (
+        environment()
+        .get_template("report/template.html.j2")
+        .render(
+            title=str(data.get("title") or "Untitled run"),
+            verdict=summary.verdict(results, len(made) if only_calibrates and isinstance(made, list) else None),
+            facts=summary.facts(data),
+            table=summary.error_table(results, data.get("paper")),
+            plans=summary.plan_rows(results),
+            calibration=known,
+            only_calibrates=only_calibrates,
+            provenance=list(summary.leaves(provenance)) if provenance else [],
+            log=summary.log_summary(data.get("log"), len(results.get("trials") or [])),
+            events=summary.event_rows(data.get("events")),
+            searches=searches,
+            devices=device_health.section(data.get("health"), data.get("events")),
+            pictures=shown,
+            trials=carried["trials"],
+            playable=any(trial["playback"] is not None for trial in carried["trials"]),
+            plotted=plotted,
+            data=payload.encode(carried),
+            drawings=drawings if drawn else "",
+            style="",
+            warnings=[],
+            scripts={name: text(HERE, name) for name in SCRIPTS},
+            plotly=plotly() if plotted or drawn else "",
+        )
     )
 
 
@@ -87,23 +90,3 @@ def _drawing(figure: Mapping[str, Any]) -> dict[str, Any]:
 
 def _list(value: Any) -> list[Any]:
     return value if isinstance(value, list) else []
-
-
-def _text(name: str) -> str:
-    return (files("experiments.report") / name).read_text(encoding="utf-8")
-
-
-@cache
-def _plotly() -> str:
-    from plotly.offline import get_plotlyjs
-
-    # Only inside strings can these occur, where the backslash changes nothing.
-    return get_plotlyjs().replace("</script", "<\\/script").replace("<!--", "<\\!--")
-
-
-@cache
-def _template():
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return environment.from_string(_text("template.html.j2"))

@@ -58,5 +58,5 @@ const Plots = (() => {
     addEventListener("afterprint", redraw);
   };
 
-  return { numbered, layout, trace, draw, whenNear, follow };
+  return { shade, numbered, layout, trace, draw, whenNear, follow };
 })();

@@ -11,9 +11,18 @@ from pathlib import Path
 
 import pytest
 
+from tests.experiments.chromium import launched
+
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # a shell has its background jobs ignore Ctrl-C, and the commands under test would inherit that
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium, for a page that draws without a graphics processor."""
+    with launched("--disable-gpu") as browser:
+        yield browser
 
 
 def free_port() -> int:

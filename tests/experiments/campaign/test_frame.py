@@ -13,24 +13,7 @@ from experiments.campaign.sweep import _conclude
 from experiments.exit_codes import ExitCode
 from mechanics.yaml_input import InputError
 
-
-def row(controller, trial, status, wrench):
-    figures = None if wrench is None else {"wrench_N": {"mean": wrench, "std": 0.1}, "eo_pose_mm": None}
-    names = {"skill": "grasped_static", "controller": controller, "trial": trial, "sensor": "soft_bubble"}
-    return {**names, "status": status, "reason": "", "measured": figures, "truth": None}
-
-
-def campaign(path, jobs):
-    """A folder as jobs leave it: ``jobs`` are (id, tags, planned rows, runs), a run (status, rows)."""
-    told = [{"id": id, "tags": tags, "trials": planned} for id, tags, planned, _ in jobs]
-    path.mkdir(parents=True)
-    (path / "campaign.json").write_text(json.dumps({"schema": 1, "experiment": "e", "jobs": told}))
-    for id, _, _, runs in jobs:
-        for number, (status, rows) in enumerate(runs):
-            run = path / "jobs" / id / (f"run.{number}" if number else "run")
-            run.mkdir(parents=True)
-            (run / "results.json").write_text(json.dumps({"status": status, "reason": "so", "trials": rows}))
-    return path
+from .campaigns import campaign, row
 
 
 @pytest.fixture
@@ -188,6 +171,17 @@ def test_a_summary_that_cannot_be_written_is_shown_and_said(pairs, tmp_path):
     assert _conclude(pairs, ExitCode.DONE, tmp_path / "x.json", shown, said)
     [first, _] = json.loads((tmp_path / "x.json").read_text())["comparisons"]
     assert first["measured"]["wrench_N"]["n"] == 4
+    assert str(pairs / "report.html") in shown.export_text()
+    assert (pairs / "report.html").is_file()
+
+
+def test_a_report_that_cannot_be_made_takes_nothing_with_it(pairs, tmp_path):
+    (pairs / "report.html").mkdir()
+    shown, said = (Console(width=200, record=True, file=io.StringIO()) for _ in range(2))
+    assert _conclude(pairs, ExitCode.DONE, None, shown, said)
+    assert (pairs / "trials.parquet").is_file()
+    text = said.export_text()
+    assert "the report could not be made" in text and f"extrinsic report {pairs}" in text
 
 
 def test_one_controller_is_compared_with_nobody(folder):

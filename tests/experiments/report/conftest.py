@@ -1,9 +1,7 @@
-"""Made-up runs, the pages that are made of them, and a browser that looks at these."""
+"""Made-up runs, and the pages that are made of them."""
 
 import copy
-import shutil
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 
@@ -15,21 +13,6 @@ from tests.experiments.report.runs import (
     build_trial,
     elasticity_samples,
 )
-
-CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    # `make` installs it where it may; elsewhere a system package of 300 MB must not keep the other tests from running
-    if not Path(CHROMIUM).exists():
-        pytest.skip(f"no chromium at {CHROMIUM}; on Debian: apt-get install chromium")
-    arguments = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

@@ -1,9 +1,7 @@
 """A run in the web viewer, in a browser: it draws, it is quiet, and no request leaves this machine."""
 
 import re
-import shutil
 import signal
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import cv2
@@ -11,22 +9,16 @@ import numpy as np
 import pytest
 
 from experiments.ports import free_port
+from tests.experiments.chromium import launched
 
-CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
-QUIET = ["--no-sandbox", "--disable-background-networking", "--no-first-run"]
 PATIENCE = 200_000  # [ms]: 43 MB of WebAssembly are compiled, and everything is drawn by the processor
 
 
 @pytest.fixture(scope="module")
 def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if not Path(CHROMIUM).exists():
-        pytest.skip(f"no chromium at {CHROMIUM}; on Debian: apt-get install chromium")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=[*SOFTWARE, *QUIET])
+    with launched(*SOFTWARE) as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
