@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -54,7 +55,7 @@ def section(health: Any, events: Any) -> dict[str, Any] | None:
     """Rows of the table, and whether there are ``ages``; None where the log says nothing of devices.
 
     A figure is (text, when, whether it is marked); ``notes`` are lines. ``events`` are those of the report: one that
-    begins with a device's name is that device's.
+    has a device's name with a colon behind it is that device's.
     """
     source = mapping(health)
     streams = [mapping(stream) for stream in source.get("streams") or []]
@@ -131,10 +132,9 @@ def _of_device(device: str, gate: Mapping[str, Any] | None, events: Any) -> list
         lines.append(f"its gates refused set-points: {by}" if by else "its gates refused nothing")
         lines += _first([f"{text}, at {t:.2f} s" for t, text in gate.get("troubles") or []])
     told_of = [mapping(event) for event in events or []] if isinstance(events, list | tuple) else []
-    about = [event for event in told_of if str(event.get("text") or "").startswith(f"{device}:")]
-    return lines + _first(
-        [f"{str(e['text']).removeprefix(f'{device}:').strip()}, at {e.get('t') or 0.0:.2f} s" for e in about]
-    )
+    named = re.compile(rf"(^|[\s;(]){re.escape(device)}:")
+    about = [(str(event["text"]), event.get("t") or 0.0) for event in told_of if named.search(str(event.get("text")))]
+    return lines + _first([f"{text.removeprefix(f'{device}:').strip()}, at {t:.2f} s" for text, t in about])
 
 
 def _first(lines: list[str]) -> list[str]:

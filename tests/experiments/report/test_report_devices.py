@@ -56,6 +56,14 @@ def test_a_log_without_ages_has_no_column_of_them(editable):
     assert "Oldest on arrival" not in render(editable)
 
 
+def test_an_event_that_speaks_of_a_device_further_on_is_told_whole():
+    events = [{"t": 3.0, "level": "warning", "text": "paused, for 30 s at most: wrist: no reading for 0.2 s"}]
+    found = device_health.section(build_health(), [*events, {"t": 4.0, "level": "info", "text": "the other wrists: 3"}])
+    assert found is not None
+    wrist = next(row for row in found["rows"] if row["device"] == "wrist")
+    assert wrist["notes"][1:] == ["paused, for 30 s at most: wrist: no reading for 0.2 s, at 3.00 s"]
+
+
 def test_events_that_name_a_device_stand_in_its_row_the_first_few():
     events = [{"t": float(i), "level": "warning", "text": f"arm: paused {i}"} for i in range(5)]
     found = device_health.section(build_health(), events)
