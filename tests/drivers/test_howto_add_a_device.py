@@ -16,29 +16,25 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-ROOT = Path(__file__).parents[2]
+from tests.pages import ROOT, blocks, free_port
+
 PAGE = ROOT / "docs" / "add-a-device.md"
 FILES = ("pyproject.toml", "acme_cell.py", "acme_emulator.py", "bench.yaml", "test_acme_cell.py", "acme_conformance.py")
 #: as they stand on the page: another program may have them here
 PORT, BUS = "5005", "7450"
 
 
-def free_port() -> str:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return str(probe.getsockname()[1])
-
-
 @pytest.fixture(scope="module")
 def package(tmp_path_factory) -> Path:
     """The page's files in a folder, and beside them what `pip install` writes for their entry points."""
     folder = tmp_path_factory.mktemp("acme")
-    ports = {PORT: free_port(), BUS: free_port()}
-    for block in re.findall(r"^```\w+\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL):
-        if named := re.match(r"# file: (\S+)\n", block):
-            text = block[named.end() :]
+    ports = {PORT: str(free_port()), BUS: str(free_port())}
+    for block in blocks(PAGE):
+        if block.file:
+            text = block.text
             for port, free in ports.items():
                 text = text.replace(port, free)
-            (folder / named.group(1)).write_text(text)
+            (folder / block.file).write_text(text)
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     installed = folder / f"acme_cell-{project['version']}.dist-info"
     installed.mkdir()
