@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from drivers.fault import Fault
+from experiments import registries
+from mechanics.json_schema import Offered
 from mechanics.yaml_input import Refusal
 
 Moment = Literal["before", "approach", "contact", "logging"]
@@ -49,6 +51,11 @@ class Cell(BaseModel):
         return (found,) if isinstance(found, str) else found
 
 
+def _known_controller(name: str) -> str:
+    registries.controllers().named(name)
+    return name
+
+
 class FaultsStage(BaseModel):
     """Run a trial of a plan once for each cell and moment, each in a run folder of its own under ``cells/``.
 
@@ -59,7 +66,9 @@ class FaultsStage(BaseModel):
 
     stage: Literal["faults"]
     plan: str = Field(min_length=1, max_length=1000)
-    controller: str = "closed_loop"
+    controller: Annotated[
+        str, AfterValidator(_known_controller), Offered(lambda: registries.controllers().usable())
+    ] = Field(default="closed_loop", description="the law of every cell")
     profile: str | None = Field(
         default=None, description="the world's mismatch profile in the cells; the station's own"
     )

@@ -39,6 +39,14 @@ def test_the_shipped_campaign_has_sixty_cells_and_more_in_every_moment() -> None
     assert any(f"{stage.count} cells" in line for line in check(load(str(SHIPPED))))
 
 
+def test_a_controller_that_does_not_exist_is_found_before_any_cell_runs() -> None:
+    with pytest.raises(InputError) as refused:
+        load(str(SHIPPED), None, ["stages.1.controller=closed_lop"])
+    [problem] = refused.value.problems
+    assert problem.key == "stages.1.controller"
+    assert (problem.wrong, problem.nearest) == ("unknown controller 'closed_lop'", "closed_loop")
+
+
 def test_a_part_of_the_campaign_ends_as_expected_with_every_log_whole(command, tmp_path: Path) -> None:
     cells = [cell for cell in shipped_cells() if (cell["fault"]["kind"], cell["fault"].get("device")) in PART]
     assert len(cells) == len(PART)

@@ -91,7 +91,7 @@ def test_what_nobody_takes_is_read_in_heaps_and_each_has_its_own_instant():
     assert np.diff([stamp.sequence for stamp in stamps]).tolist() == [1] * 499
     measured, read = (np.diff([getattr(s, name) for s in stamps]) * 1e-6 for name in ("capture_ns", "receive_ns"))
     assert np.median(measured) == pytest.approx(1.0, rel=0.2)  # ms
-    assert np.median(read) < 0.2
+    assert np.sort(read)[-50:].sum() > 0.5 * read.sum()  # one by one, a tenth of the gaps is a tenth of the time
 
 
 def theirs(box: NetFtBox) -> pynetft.Config:
