@@ -12,7 +12,7 @@
   // A cell's name beside the figure: a line for each value where it is long, the whole of them stands in the table.
   const label = (name) => {
     const parts = name.length > 24 ? name.split(" · ") : [name];
-    return parts.map((part) => plain(part.length > 28 ? `${part.slice(0, 27)}…` : part)).join("<br>");
+    return parts.map((part) => plain(part.length > 34 ? `${part.slice(0, 33)}…` : part)).join("<br>");
   };
   const chosen = (name) => document.querySelector(`input[name="source-${name}"]:checked`)?.value;
 
