@@ -95,11 +95,12 @@ def _unfinished(folder: Path) -> str:
     asked = read_json(folder / ASKED, _Asked)
     title = "" if asked is None else str(asked["table"].get("title") or "")
     told = list(campaigns(folder))
-    count = f"{sum(one['ended'] for one in told)} of {sum(one['jobs'] for one in told)} jobs begun so far have ended"
+    jobs, ended = (sum(one[key] for one in told) for key in ("jobs", "ended"))
+    count = f"{ended} of {jobs} jobs begun so far have ended" if told else "Nothing of it was run"
     detail = f"{count}. The same command with the same --out goes on with what is missing."
     return _rendered(
         title=title or "A table",
-        verdict=Verdict("aborted", "Unfinished", detail if told else "Nothing of it was run."),
+        verdict=Verdict("aborted", "Unfinished", detail),
         campaigns=told,
     )
 
