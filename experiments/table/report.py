@@ -116,8 +116,10 @@ def verdict(result: Mapping[str, Any], done: int, trials: int) -> Verdict:
     count, short = f"{done} of {trials} trials completed", result["shortfalls"]
     held = sum(one.get("holds") is not None for one in result["findings"])
     if short:
-        return Verdict("short", "Fell short", f"{len(short)} targets are missed; {count}.")
-    targets = f"all {held} targets are met; " if held else ""
+        return Verdict(
+            "short", "Fell short", f"{len(short)} {'targets are' if len(short) > 1 else 'target is'} missed; {count}."
+        )
+    targets = f"All {held} targets are met; " if held else ""
     return Verdict("completed", "Completed", f"{targets}{count}.")
 
 
