@@ -130,17 +130,18 @@ def check(experiment: Experiment, station: StationOption = None, sets: Sets = No
 def report(
     run_folder: RunOrSweep,
 ) -> None:
-    """Rebuild a run's report from its log, or a sweep's from its jobs."""
-    from experiments.campaign.folder import is_campaign
+    """Rebuild a run's report from its log; a sweep's or a table's from its jobs."""
+    from experiments.campaign.folder import is_campaign, is_table
     from experiments.progress import Progress
     from experiments.report.build import build_report
     from experiments.run_folder import RunFolder
 
-    if is_campaign(run_folder):
-        from experiments.campaign.report.build import rebuild
+    if is_campaign(run_folder) or is_table(run_folder):
+        from experiments.campaign.report import build as of_campaign
+        from experiments.table import report as of_table
 
         with Progress(terminal(stderr=True)).share("make the report"):
-            path = rebuild(run_folder)
+            path = (of_campaign if is_campaign(run_folder) else of_table).rebuild(run_folder)
         terminal().print(f"report: {path}", soft_wrap=True, highlight=False)
         return
     folder = RunFolder.open(run_folder)

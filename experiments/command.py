@@ -39,7 +39,9 @@ StationOption = Annotated[
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.", autocompletion=completion.runs)]
 RunOrSweep = Annotated[
     Path,
-    typer.Argument(metavar="RUN", help="A run folder, or a sweep's.", autocompletion=completion.runs_and_sweeps),
+    typer.Argument(
+        metavar="RUN", help="The folder of a run, a sweep or a table.", autocompletion=completion.runs_and_sweeps
+    ),
 ]
 Sets = Annotated[
     list[str] | None,

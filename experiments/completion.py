@@ -44,8 +44,8 @@ def runs(incomplete: str) -> Completed:
 
 
 def runs_and_sweeps(incomplete: str) -> Completed:
-    """The newest run folders and sweeps' folders under ``runs/``."""
-    return _newest(incomplete, "experiment.yaml", "campaign.json")
+    """The newest folders of runs, sweeps and tables under ``runs/``."""
+    return _newest(incomplete, "experiment.yaml", "campaign.json", "asked.json")
 
 
 def _newest(incomplete: str, *marks: str) -> Completed:

@@ -30,6 +30,8 @@ _RUN = re.compile(r"run(?:\.([1-9][0-9]{0,8}))?")
 
 #: what says which jobs a campaign has
 _TOLD = "campaign.json"
+#: what says what a table's folder was begun for
+ASKED = "asked.json"
 
 
 class JobFolder:
@@ -113,6 +115,11 @@ class _Campaign(BaseModel):
 def is_campaign(path: Path) -> bool:
     """Whether a campaign lies in a folder, and no run."""
     return (path / _TOLD).is_file()
+
+
+def is_table(path: Path) -> bool:
+    """Whether a table lies in a folder, or was begun there: its campaigns are below."""
+    return (path / ASKED).is_file()
 
 
 class CampaignFolder:

@@ -8,10 +8,9 @@ from typing import Any
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from experiments.campaign.report.collect import link_to
-from experiments.campaign.report.page import style
+from experiments.campaign.report.page import filled
 from experiments.faults.schema import MOMENTS, FaultsStage
 from experiments.files import Resolved
-from experiments.report import parts
 from experiments.report.summary import Verdict, facts, leaves, words
 from experiments.results_file import Word
 from experiments.run_folder import RunFolder
@@ -58,27 +57,24 @@ def render(folder: RunFolder, resolved: Resolved, data: Mapping[str, Any]) -> st
     planned = list(_planned(resolved))
     moments = [moment for moment in MOMENTS if any(at == moment for _, at in planned)]
     provenance = results.get("provenance")
-    return (
-        parts.environment()
-        .get_template("faults/report.html.j2")
-        .render(
-            title=f"Fault campaign “{data['title']}”",
-            verdict=verdict(rows, len(planned), results),
-            facts=[
-                *((label, value) for label, value in facts(data) if label != "Profile"),
-                ("Profile of the cells", _profile(resolved)),
-                ("Cells", f"{len(rows)} of {len(planned)}"),
-            ],
-            warnings=[],
-            moments=moments,
-            matrix=matrix(rows, planned, moments, links),
-            missing=[f"{name}, {moment}" for name, moment in planned[len(rows) :]],
-            short=[(row.name, links[row.name], row.short) for row in rows if row.short],
-            worst=worst(rows, links),
-            cells=[_told(row, links) for row in rows],
-            provenance=list(leaves(provenance)) if provenance else [],
-            style=style(),
-        )
+    return filled(
+        "faults/report.html.j2",
+        {},
+        title=f"Fault campaign “{data['title']}”",
+        verdict=verdict(rows, len(planned), results),
+        facts=[
+            *((label, value) for label, value in facts(data) if label != "Profile"),
+            ("Profile of the cells", _profile(resolved)),
+            ("Cells", f"{len(rows)} of {len(planned)}"),
+        ],
+        warnings=[],
+        moments=moments,
+        matrix=matrix(rows, planned, moments, links),
+        missing=[f"{name}, {moment}" for name, moment in planned[len(rows) :]],
+        short=[(row.name, links[row.name], row.short) for row in rows if row.short],
+        worst=worst(rows, links),
+        cells=[_told(row, links) for row in rows],
+        provenance=list(leaves(provenance)) if provenance else [],
     )
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 from rich.console import Console
 
 from experiments.campaign.engine import reach, run_jobs
-from experiments.campaign.folder import CampaignFolder, copied
+from experiments.campaign.folder import ASKED, CampaignFolder, copied
 from experiments.campaign.frame import trials_frame
 from experiments.campaign.jobs import Job, JobOutcome
 from experiments.check import check
@@ -25,8 +25,6 @@ from experiments.table.schema import RunEntry, Table
 from mechanics.yaml_input import InputError, Problem
 from planning.errors import InfeasiblePlan
 
-#: what a table's folder was begun for
-ASKED = "asked.json"
 #: a trial that ended so took the rest of its job with it
 _TOOK_THE_REST = ("stopped", "diverged")
 

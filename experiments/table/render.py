@@ -55,12 +55,13 @@ def said(line: str, cell: Mapping[str, Any], first: bool = True) -> str:
     return "" if cell[line] is None and line != "measured" else spread(cell[line])
 
 
-def _lines(row: Mapping[str, Any]) -> list[str]:
-    """Those that say something in some cell of the row."""
+def lines(row: Mapping[str, Any]) -> list[str]:
+    """Those of `LINES` that say something in some cell of the row."""
     return [line for line in LINES if any(said(line, cell) for cell in row["cells"])]
 
 
-def _heads(panel: Mapping[str, Any], join: str) -> list[str]:
+def heads(panel: Mapping[str, Any], join: str = " ") -> list[str]:
+    """What stands above each figure of a panel."""
     return [join.join([*tagged(column["tags"]), HEADINGS[column["figure"]]]) for column in panel["columns"]]
 
 
@@ -69,13 +70,13 @@ def panel_grid(panel: Mapping[str, Any]) -> Grid:
     grid = Grid(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False, title=panel["title"], title_justify="left")
     grid.add_column("", no_wrap=True)
     grid.add_column("", no_wrap=True, style="dim")
-    for head in _heads(panel, "\n"):
+    for head in heads(panel, "\n"):
         grid.add_column(escape(head.replace(" [", "\n[")), justify="right", no_wrap=True)
     for row in panel["rows"]:
-        lines = _lines(row)
+        told = lines(row)
         first = row["cells"][0]["figure"]
-        cells = ["\n".join(_coloured(line, cell, cell["figure"] == first) for line in lines) for cell in row["cells"]]
-        grid.add_row(escape("\n".join(tagged(row["tags"]))), "\n".join(lines), *cells, end_section=True)
+        cells = ["\n".join(_coloured(line, cell, cell["figure"] == first) for line in told) for cell in row["cells"]]
+        grid.add_row(escape("\n".join(tagged(row["tags"]))), "\n".join(told), *cells, end_section=True)
     return grid
 
 
@@ -136,7 +137,7 @@ def legend(result: Mapping[str, Any]) -> list[str]:
 
 def calibrated(result: Mapping[str, Any]) -> list[str]:
     """Stiffness and friction that were found, a line for each calibration."""
-    lines = []
+    found = []
     for name, files in result["calibrations"].items():
         told = []
         for one in files:
@@ -147,8 +148,8 @@ def calibrated(result: Mapping[str, Any]) -> list[str]:
                 low, high = one["interval"]
                 told.append(f"µ {one['pair']} {one['mu']:.3f} ({low:.3f}…{high:.3f})")
         if told:
-            lines.append(f"calibrated, {name}: {'; '.join(told)}")
-    return lines
+            found.append(f"calibrated, {name}: {'; '.join(told)}")
+    return found
 
 
 def ended_early(result: Mapping[str, Any]) -> list[str]:
@@ -164,27 +165,27 @@ def ended_early(result: Mapping[str, Any]) -> list[str]:
 
 def markdown(result: Mapping[str, Any]) -> str:
     """The same to be read in a browser or an editor."""
-    lines = [f"# {result['title']}", "", _about(result), ""]
+    page = [f"# {result['title']}", "", _about(result), ""]
     for panel in result["panels"]:
-        lines += [f"## {panel['title']}", ""] if panel["title"] else []
+        page += [f"## {panel['title']}", ""] if panel["title"] else []
         body = []
         for row in panel["rows"]:
             name = f"**{', '.join(tagged(row['tags']))}**"
-            for line in _lines(row):
+            for line in lines(row):
                 first = row["cells"][0]["figure"]
                 body.append([name, line, *(said(line, cell, cell["figure"] == first) for cell in row["cells"])])
                 name = ""
-        lines += [*_pipes(["", "", *_heads(panel, " ")], body), ""]
+        page += [*_pipes(["", "", *heads(panel)], body), ""]
     if result["findings"]:
         body = [[one["name"], one["told"], one["target"] or "", _holds(one)] for one in result["findings"]]
-        lines += ["## Held against", "", *_pipes(["", "ours", "target", "holds"], body), ""]
+        page += ["## Held against", "", *_pipes(["", "ours", "target", "holds"], body), ""]
     incomplete = ended_early(result)
     if incomplete:
-        lines += ["## Trials that were not completed", "", *(f"* {line}" for line in incomplete), ""]
-    lines += [f"* {line}" for line in (*legend(result), *calibrated(result))]
-    return "\n".join(lines) + "\n"
+        page += ["## Trials that were not completed", "", *(f"* {line}" for line in incomplete), ""]
+    page += [f"* {line}" for line in (*legend(result), *calibrated(result))]
+    return "\n".join(page) + "\n"
 
 
-def _pipes(heads: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
-    rows = [heads, ["---", *["---:"] * (len(heads) - 1)], *body]
+def _pipes(head: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
+    rows = [head, ["---", *["---:"] * (len(head) - 1)], *body]
     return ["| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows]

@@ -19,6 +19,7 @@ from experiments.run_folder import write_atomic, write_json
 from experiments.table import aggregate, jobs, render
 from experiments.table.jobs import Options
 from experiments.table.measure import CalibrationFailed, Engine, measure
+from experiments.table.report import write_report
 from experiments.table.schema import Table
 from experiments.terminal import terminal
 from mechanics.yaml_input import parse, read_yaml
@@ -57,6 +58,10 @@ def main(
     except OSError as error:
         raise disk.not_kept(error, folder) from None
     console.print(f"table: {folder / 'table.md'}", soft_wrap=True, highlight=False)
+    try:
+        console.print(f"report: {write_report(folder)}", soft_wrap=True, highlight=False)
+    except Exception as error:  # the trials are run and the table is kept: say it and go on
+        said.print(f"the report could not be made: {error}\n  extrinsic report {folder}", style="yellow", markup=False)
     for line in result["shortfalls"] if check else []:
         said.print(f"short: {line}", style="red", highlight=False, markup=False, soft_wrap=True)
     if any(trial["status"] in ("failed", "device_failed") for trial in result["incomplete"]):

@@ -9,10 +9,14 @@
 
   // Plotly takes tags for its own.
   const plain = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
-  // A cell's name beside the figure: a line for each value where it is long, the whole of them stands in the table.
+  // A cell's name beside the figure, in lines of a few values where it is long; the whole of it stands in the table.
   const label = (name) => {
-    const parts = name.length > 24 ? name.split(" · ") : [name];
-    return parts.map((part) => plain(part.length > 28 ? `${part.slice(0, 27)}…` : part)).join("<br>");
+    const lines = [];
+    for (const part of name.split(" · ")) {
+      const joined = lines.length ? `${lines.at(-1)} · ${part}` : part;
+      if (lines.length && joined.length <= 24) lines[lines.length - 1] = joined; else lines.push(part);
+    }
+    return lines.map((line) => plain(line.length > 34 ? `${line.slice(0, 33)}…` : line)).join("<br>");
   };
   const chosen = (name) => document.querySelector(`input[name="source-${name}"]:checked`)?.value;
 
