@@ -119,8 +119,10 @@ def _error(found: Sequence[float | None], decimals: int) -> dict[str, str] | Non
     told = points.estimate(found)
     if told is None:
         return None
-    spread = float(np.std([value for value in found if value is not None]))
-    return {"mean": f"{told.mean:.{decimals}f}", "std": f"{spread:.{decimals}f}", "interval": _interval(told, decimals)}
+    shown = {"mean": f"{told.mean:.{decimals}f}", "interval": _interval(told, decimals)}
+    if told.n > 1:  # a single trial has no spread
+        shown["std"] = f"{np.std([value for value in found if value is not None]):.{decimals}f}"
+    return shown
 
 
 def _interval(told: Estimate, decimals: int, sign: str = "") -> str:
