@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.experiments.chromium import launched
+from tests.experiments.chromium import launched, opener
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # a shell has its background jobs ignore Ctrl-C, and the commands under test would inherit that
@@ -23,6 +23,13 @@ def browser():
     """Chromium, for a page that draws without a graphics processor."""
     with launched("--disable-gpu") as browser:
         yield browser
+
+
+@pytest.fixture(scope="module")
+def open_page(browser):
+    """See `tests.experiments.chromium.opener`."""
+    with opener(browser) as open_page:
+        yield open_page
 
 
 def free_port() -> int:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from experiments.cli import app
 from experiments.files import dump_resolved, load
 from tests.experiments.campaign.test_report import Page
+from tests.experiments.chromium import assert_quiet_and_within
 from tests.experiments.test_faults import campaign
 
 CELLS = [
@@ -96,3 +97,11 @@ def test_rows_that_no_run_has_written_are_refused(folder: Path) -> None:
     ended = CliRunner().invoke(app, ["report", str(folder)])
     assert ended.exit_code == 2
     assert "`faults` cannot be read" in ended.output
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (800, "dark")])
+def test_the_page_is_quiet_asks_for_nothing_and_fits(folder: Path, open_page: Any, width: int, scheme: str) -> None:
+    made(folder)
+    page = open_page(folder / "report.html", width, scheme)
+    page.locator("#provenance-title").scroll_into_view_if_needed()
+    assert_quiet_and_within(page, width)

@@ -4,6 +4,7 @@ import pandas as pd
 import pytest
 
 from experiments.campaign.report.build import rebuild
+from tests.experiments.chromium import assert_quiet_and_within
 from tests.experiments.report.pages import wait_until
 
 from .campaigns import campaign, row
@@ -34,28 +35,15 @@ def sweep(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def show(browser):
-    contexts = []
-
-    def open_report(folder, width=1280, scheme="light"):
-        file = rebuild(folder)
-        context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, offline=True)
-        context.set_default_timeout(30_000)
-        contexts.append(context)
-        page = context.new_page()
-        page.heard = []
-        page.on("console", lambda message: page.heard.append(f"{message.type}: {message.text}"))
-        page.on("pageerror", lambda error: page.heard.append(f"error: {error}"))
-        page.on("request", lambda request: request.url == file.as_uri() or page.heard.append(f"request: {request.url}"))
-        page.goto(file.as_uri())
+def show(open_page):
+    def show(folder, width=1280, scheme="light"):
+        page = open_page(rebuild(folder), width, scheme)
         for plot in page.locator(".trials-plot").all():
             plot.scroll_into_view_if_needed()
             plot.locator(".scatterlayer .trace").first.wait_for(state="attached")
         return page
 
-    yield open_report
-    for context in contexts:
-        context.close()
+    return show
 
 
 @pytest.fixture(scope="module")
@@ -82,10 +70,7 @@ def drawn(page, number, axis):
 def test_the_page_is_quiet_asks_for_nothing_and_fits(show, sweep, width, scheme):
     page = show(sweep, width, scheme)
     page.locator("details summary").click()
-    assert page.heard == []
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    for table in page.locator(".scroll").all():
-        assert table.evaluate("box => box.scrollWidth - box.clientWidth") <= 1, table.inner_text()
+    assert_quiet_and_within(page, width)
     colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert colour == {"light": "rgb(255, 255, 255)", "dark": "rgb(20, 23, 26)"}[scheme]
     for plot in page.locator(".trials-plot").all():

@@ -16,31 +16,15 @@ from tests.experiments.report.runs import (
 
 
 @pytest.fixture(scope="module")
-def show(browser, tmp_path_factory):
-    """Open the report of a run from disk, off line; what it complains of and asks for is in ``page.heard``.
+def show(open_page, tmp_path_factory):
+    """Open the report of a run."""
 
-    A picture whose bytes stand in the page is no request.
-    """
-    contexts = []
-
-    def open_report(run, width=1280, scheme="light"):
+    def show(run, width=1280, scheme="light"):
         path = tmp_path_factory.mktemp("report") / "report.html"
         path.write_text(render(run), encoding="utf-8")
-        context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme, offline=True)
-        context.set_default_timeout(30_000)
-        contexts.append(context)
-        page = context.new_page()
-        page.heard = []
-        page.on("console", lambda message: page.heard.append(f"{message.type}: {message.text}"))
-        page.on("pageerror", lambda error: page.heard.append(f"error: {error}"))
-        own = (path.as_uri(), "data:image/")
-        page.on("request", lambda request: request.url.startswith(own) or page.heard.append(f"request: {request.url}"))
-        page.goto(path.as_uri())
-        return page
+        return open_page(path, width, scheme)
 
-    yield open_report
-    for context in contexts:
-        context.close()
+    return show
 
 
 @pytest.fixture(scope="session")

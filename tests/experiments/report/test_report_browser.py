@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from tests.experiments.chromium import assert_quiet_and_within
 from tests.experiments.report.pages import (
     draw_calibrations,
     draw_traces,
@@ -47,10 +48,7 @@ def test_the_page_is_quiet_asks_for_nothing_and_fits(request, show, name, width,
         page.locator("#play").click()
     for i in range(page.locator("details").count()):
         page.locator("details summary").nth(i).click()
-    assert page.heard == []
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    for table in page.locator(".scroll").all():
-        assert table.evaluate("box => box.scrollWidth - box.clientWidth") <= 1, table.inner_text()
+    assert_quiet_and_within(page, width)
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (800, "dark")])
@@ -58,10 +56,7 @@ def test_a_page_that_only_calibrates_is_quiet_and_fits(show, calibrated, width, 
     page = show(calibrated, width, scheme)
     draw_calibrations(page)
     assert page.locator(".calibration-plot").count() == 4
-    assert page.heard == []
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    for table in page.locator(".scroll").all():
-        assert table.evaluate("box => box.scrollWidth - box.clientWidth") <= 1, table.inner_text()
+    assert_quiet_and_within(page, width)
     paper = {"light": "#ffffff", "dark": "#14171a"}
     for plot in page.locator(".calibration-plot").all():
         assert plot.evaluate("plot => plot.layout.paper_bgcolor") == paper[scheme]

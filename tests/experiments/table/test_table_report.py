@@ -11,6 +11,7 @@ from experiments.table import run
 from experiments.table.jobs import Options
 from experiments.table.run import main
 from tests.experiments.campaign.test_report import Page
+from tests.experiments.chromium import assert_quiet_and_within
 
 
 @pytest.fixture
@@ -84,3 +85,14 @@ def test_a_report_that_cannot_be_made_takes_no_table_with_it(made, small, tmp_pa
     main(str(small), Options(), made.engine(), tmp_path / "out")
     assert json.loads((tmp_path / "out" / "table.json").read_text())["table"] == "small"
     assert "the report could not be made: no ink" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (800, "dark")])
+def test_the_page_is_quiet_asks_for_nothing_and_fits(out, open_page, width, scheme):
+    rebuilt(out)
+    page = open_page(out / "report.html", width, scheme)
+    for plot in page.locator(".trials-plot").all():
+        plot.scroll_into_view_if_needed()
+        plot.locator(".scatterlayer .trace").first.wait_for(state="attached")
+    assert page.locator(".trials-plot").count() > 0
+    assert_quiet_and_within(page, width)
