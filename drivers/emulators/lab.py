@@ -51,6 +51,8 @@ _EMPTY = 128
 _LATEST = 2.0
 #: how finely it goes that way [ns], and how far behind the robot's newest pose without hurry [s]
 _PIECE_NS, _BACKLOG = 4_000_000, 0.03
+#: how far a robot strays that holds its pose [m, m, rad]; it rests where it keeps within a share of that so long [s]
+_WOBBLE, _REST, _CALM = np.array([1e-4, 1e-4, 2e-3]), 0.3, 0.2
 #: how long the picture of an untouched finger may take, which is the mean of many [s]
 _REFERENCE = 20.0
 #: how often the robot's pose leads the plant [Hz], and the planar pose of ee that it begins at
@@ -178,11 +180,12 @@ class EmulatedLab(Host):
         while span_ns > 0:
             piece = min(span_ns, _PIECE_NS)
             pose, twist = self._way.ahead(piece * 1e-9)
+            sets_out = self._way.sets_out(piece * 1e-9)
             x, y, angle = pose.tolist()
             vx, vy, turn = twist.tolist()
             for device in self.world.devices.values():
                 if isinstance(device, SimArm):
-                    device.follow((x, y, angle), (vx, vy, turn), piece * 1e-9)
+                    device.follow((x, y, angle), (vx, vy, turn), piece * 1e-9, sets_out=sets_out)
             super()._step(piece)
             span_ns -= piece
 
@@ -197,6 +200,7 @@ class _Way:
     def __init__(self, time: float, pose: Array):
         self._poses: deque[tuple[float, Array]] = deque([(time, pose)])
         self._at, self._pose = time, pose
+        self._stood, self._calm = pose, _CALM
 
     def told(self, time: float, pose: Array) -> None:
         """The robot is at ``pose`` (3,) at its own ``time`` [s]; from any thread."""
@@ -216,6 +220,19 @@ class _Way:
             pose = p0 + share * (p1 - p0)
         self._pose = pose
         return pose, (pose - before) / span
+
+    def sets_out(self, span: float) -> bool:
+        """Whether the last ``span`` seconds began a motion: it has left where it stood, by more than a robot wobbles.
+
+        A robot that holds its pose is never quite still. Each of its micrometres taken for a motion, with an error of
+        repeatability of its own, would have the plant shake by tenths of a newton.
+        """
+        stood = self._calm >= _CALM
+        if (np.abs(self._pose - self._stood) < _WOBBLE * (1.0 if stood else _REST)).all():
+            self._calm += span
+            return False
+        self._stood, self._calm = self._pose, 0.0
+        return stood
 
 
 class _Eye:

@@ -176,17 +176,20 @@ class SimArm(Simulated[PoseReading], Arm):
         sx, sy, st = (s * d for s, d in zip(self._spread, draws, strict=True))
         self._error_before, self._error_step, self._building = self._error, (sx - x, sy - y, st - t), 0.0
 
-    def follow(self, pose: Pose, twist: Pose, duration: float) -> None:
+    def follow(self, pose: Pose, twist: Pose, duration: float, *, sets_out: bool | None = None) -> None:
         """Cubic Hermite from the present aim and its twist to the given ones, ``duration`` seconds from now.
 
-        This is the motion itself, without lease, stop or checks: `command` is for whoever commands the arm.
+        This is the motion itself, without lease, stop or checks: `command` is for whoever commands the arm. Whether it
+        ``sets_out`` on a motion, which has an error of its own, is by default told by its having been at rest.
         """
         T = duration
         x, y, angle = self._aim
         # the nearest turn of the target's angle, so that the arm never unwinds
         goal = (pose[0], pose[1], angle + remainder(pose[2] - angle, 2 * pi))
-        at_rest = not self._cubics and self._aim_twist == ZERO
-        if at_rest and self._spread != ZERO and max(abs(a - b) for a, b in zip(goal, self._aim, strict=True)) > ARRIVED:
+        if sets_out is None:
+            at_rest = not self._cubics and self._aim_twist == ZERO
+            sets_out = at_rest and max(abs(a - b) for a, b in zip(goal, self._aim, strict=True)) > ARRIVED
+        if sets_out and self._spread != ZERO:
             self._leave_rest()
         self._cubics = []
         for p0, v0, p1, v1 in zip((x, y, angle), self._aim_twist, goal, twist, strict=True):
