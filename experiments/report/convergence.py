@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from experiments.report.summary import duration, is_number, mapping, words
+from experiments.report.summary import duration, is_number, listed, mapping, words
 from planning.plan_file import PlanFileError, load
 
 HEIGHT = 260  # [px]
@@ -56,7 +56,7 @@ def figures(plans: Any, rows: Any) -> list[dict[str, Any]]:
 
 
 def _figure(plan: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any] | None:
-    curve, asked = _list(told.get("curve")), _list(told.get("curve_queries"))
+    curve, asked = listed(told.get("curve")), listed(told.get("curve_queries"))
     by_query = len(asked) == len(curve) and all(is_number(n) for n in asked)
     across = asked if by_query else list(range(1, len(curve) + 1))
     points = [(x, y) for x, y in zip(across, curve, strict=True) if is_number(y) and math.isfinite(y)]
@@ -69,7 +69,7 @@ def _figure(plan: Mapping[str, Any], told: Mapping[str, Any]) -> dict[str, Any] 
     fall = f"from {losses[0]:.4g} to {min(losses):.4g}"
     text = f"Loss {fall} in {_count(plan.get('queries'))} queries and {_seconds(told.get('optimising_s'))}; {ended}."
     terms = {str(k): v for k, v in mapping(told.get("terms")).items() if is_number(v) and abs(v) > LEAST * min(losses)}
-    shortfalls = [str(item) for item in _list(told.get("shortfalls"))]
+    shortfalls = [str(item) for item in listed(told.get("shortfalls"))]
     return {
         "name": str(plan.get("name")),
         "text": text,
@@ -95,10 +95,6 @@ def _layout(across: str, positive: bool) -> dict[str, Any]:
         "yaxis": {"type": "log", "exponentformat": "power"} if positive else {},
         "annotations": [{**title, "text": "loss", "font": {"size": 12}, "showarrow": False}],
     }
-
-
-def _list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else []
 
 
 def _count(value: Any) -> str:

@@ -45,7 +45,7 @@ def render(data: Mapping[str, Any]) -> str:
         figure["index"] = index
     styles = {**calibration.styles(), **convergence.STYLES}
     drawings = payload.encode({"figures": [_drawing(figure) for figure in drawn], "styles": styles})
-    shots = pictures.carried(_list(data.get("trials")), data.get("imagers"))
+    shots = pictures.carried(summary.listed(data.get("trials")), data.get("imagers"))
     shown = payload.encode(shots) if any(shots["trials"]) or shots["imagers"] else ""
     carried = payload.build(data, reserved=len(shown) + (len(drawings) if drawn else 0))
     carried["figures"] = [traces.figure(trial) for trial in carried["trials"]]
@@ -86,7 +86,3 @@ def render(data: Mapping[str, Any]) -> str:
 
 def _drawing(figure: Mapping[str, Any]) -> dict[str, Any]:
     return {"data": figure["data"], "layout": figure["layout"], "wide": figure.get("wide", False)}
-
-
-def _list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else []

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from experiments.report.summary import listed, mapping
+
 MODES = ("stick", "slip+", "slip-", "free")
 SERIES = ("ee", "go", "eo", "wrench")
 BUDGET = 2_800_000  # bytes of data; with plotly's 4.8 MB the page stays under 8 MB
@@ -51,8 +53,8 @@ def build(data: Mapping[str, Any], reserved: int = 0) -> dict[str, Any]:
 
     ``reserved``: bytes of the budget that the page needs for other things.
     """
-    objects = _mapping(data.get("objects"))
-    trials = [_mapping(trial) for trial in _list(data.get("trials"))]
+    objects = mapping(data.get("objects"))
+    trials = [mapping(trial) for trial in listed(data.get("trials"))]
     out = {
         "objects": {role: _object(objects.get(role)) for role in ("go", "eo")},
         "grasp": _vector(data.get("grasp"), 3) or [0.0, 0.0, 0.0],
@@ -61,16 +63,6 @@ def build(data: Mapping[str, Any], reserved: int = 0) -> dict[str, Any]:
     }
     _thin(out["trials"], BUDGET - reserved)
     return out
-
-
-def _mapping(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}
-
-
-def _list(value: Any) -> list[Any]:
-    if isinstance(value, np.ndarray):
-        return list(value)
-    return list(value) if isinstance(value, list | tuple) else []
 
 
 def _number(value: Any) -> float | None:
@@ -84,7 +76,7 @@ def _number(value: Any) -> float | None:
 
 
 def _vector(value: Any, size: int) -> list[float] | None:
-    numbers = [_number(item) for item in _list(value)[:size]]
+    numbers = [_number(item) for item in listed(value)[:size]]
     known = [number for number in numbers if number is not None]
     return known if len(known) == size else None
 
@@ -92,15 +84,15 @@ def _vector(value: Any, size: int) -> list[float] | None:
 def _object(value: Any) -> dict[str, Any] | None:
     if not isinstance(value, Mapping):
         return None
-    vertices = [vertex for item in _list(value.get("vertices")) if (vertex := _vector(item, 2)) is not None]
+    vertices = [vertex for item in listed(value.get("vertices")) if (vertex := _vector(item, 2)) is not None]
     return {"name": str(value.get("name") or ""), "vertices": vertices}
 
 
 def _series(value: Any, count: int) -> dict[str, list[list[float] | None] | None] | None:
     """``ee``, ``go``, ``eo``, ``wrench``: each ``count`` vectors or None; None altogether where nothing is known."""
-    source, out = _mapping(value), {}
+    source, out = mapping(value), {}
     for key in SERIES:
-        rows = [_vector(row, 3) for row in _list(source.get(key))[:count]]
+        rows = [_vector(row, 3) for row in listed(source.get(key))[:count]]
         rows += [None] * (count - len(rows))
         out[key] = rows if any(row is not None for row in rows) else None
     return out if any(rows is not None for rows in out.values()) else None
@@ -111,7 +103,7 @@ def _contact(value: Any) -> list[Any] | None:
 
     The normal and µ end the list where both are known, of planned contacts; the name where it has one.
     """
-    source = _mapping(value)
+    source = mapping(value)
     point = _vector(source.get("point"), 2)
     if point is None:
         return None
@@ -125,13 +117,13 @@ def _contact(value: Any) -> list[Any] | None:
 
 
 def _contacts(value: Any, count: int) -> list[list[list[Any]]]:
-    steps = [[c for item in _list(step) if (c := _contact(item)) is not None] for step in _list(value)[:count]]
+    steps = [[c for item in listed(step) if (c := _contact(item)) is not None] for step in listed(value)[:count]]
     return steps + [[] for _ in range(count - len(steps))]
 
 
 def _times(value: Any, count: int) -> tuple[list[float], list[bool]]:
     """Instants of the waypoints [s] and which of them were reached; those that were not follow at the usual step."""
-    known = [_number(t) for t in _list(value)[:count]]
+    known = [_number(t) for t in listed(value)[:count]]
     known += [None] * (count - len(known))
     reached = [t is not None for t in known]
     instants = [t for t in known if t is not None]
@@ -144,10 +136,10 @@ def _times(value: Any, count: int) -> tuple[list[float], list[bool]]:
 
 
 def _waypoints(value: Any) -> dict[str, Any] | None:
-    source = _mapping(value)
-    parts = [_mapping(source.get(part)) for part in ("planned", "measured", "truth")]
+    source = mapping(value)
+    parts = [mapping(source.get(part)) for part in ("planned", "measured", "truth")]
     count = max(
-        [len(_list(source.get("t")))] + [len(_list(part.get(key))) for part in parts for key in SERIES], default=0
+        [len(listed(source.get("t")))] + [len(listed(part.get(key))) for part in parts for key in SERIES], default=0
     )
     if not count:
         return None
@@ -175,15 +167,15 @@ def _take_turn(found: dict[str, Any] | None, planned: dict[str, Any] | None) -> 
 
 def _playback(value: Any, waypoints: dict[str, Any] | None) -> dict[str, Any] | None:
     """The recorded frames in the order of time; from the waypoints where no frame was recorded."""
-    source = _mapping(value)
-    stamps = [_number(t) for t in _list(source.get("t"))]
+    source = mapping(value)
+    stamps = [_number(t) for t in listed(source.get("t"))]
     frames = sorted((t, i) for i, t in enumerate(stamps) if t is not None)
     series = _series(source, len(stamps))
     if not frames or series is None:
         return _stepwise(waypoints)
     order = [i for _, i in frames]
     contacts = _contacts(source.get("contacts"), len(stamps))
-    labels = [str(label or "") for label in _list(source.get("phase"))]
+    labels = [str(label or "") for label in listed(source.get("phase"))]
     phases = list(zip([t for t, _ in frames], [labels[i] if i < len(labels) else "" for i in order], strict=True))
     return {
         "t": [t for t, _ in frames],

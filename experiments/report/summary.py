@@ -6,6 +6,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
+import numpy as np
+
 COMPLETED = {"completed", "done", "ok", "success"}
 SHORT = {"fell_short", "short", "shortfall", "slipped", "lost_contact", "diverged"}
 ABORTING = {"stopped", "device_failed"}  # trials that end so take the run with them (exit codes 3 and 4)
@@ -246,6 +248,11 @@ def _plain(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(f"[{_plain(item)}]" if isinstance(item, list) else _plain(item) for item in value)
     return str(value)
+
+
+def listed(value: Any) -> list[Any]:
+    """``value`` as a list where it is a list, a tuple or an array, else an empty one."""
+    return list(value) if isinstance(value, list | tuple | np.ndarray) else []
 
 
 def mapping(value: Any) -> Mapping[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from experiments.run_folder import RunFolder
 from tests.experiments.chromium import launched, opener
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -30,6 +32,12 @@ def open_page(browser):
     """See `tests.experiments.chromium.opener`."""
     with opener(browser) as open_page:
         yield open_page
+
+
+@pytest.fixture
+def run(finished, tmp_path):
+    """A copy of the folder of a module's ``finished`` run, to be damaged."""
+    return RunFolder(shutil.copytree(finished.folder, tmp_path / "run"))
 
 
 def free_port() -> int:

@@ -36,12 +36,6 @@ def finished(shared_command):
     return done
 
 
-@pytest.fixture
-def run(finished, tmp_path):
-    """A copy of its folder, to be damaged."""
-    return RunFolder(shutil.copytree(finished.folder, tmp_path / "run"))
-
-
 def without(row, keys):
     return {key: value for key, value in row.items() if key not in keys}
 

@@ -80,9 +80,7 @@ def collect(campaign: CampaignFolder, summary: Mapping[str, Any], trials: pd.Dat
         tuple(_given_up(jobs, folders, campaign.path)),
         tuple(sorted(str(results["started"]) for results in ended if results.get("started"))),
         tuple(dict.fromkeys(_station(results) for results in ended if results.get("station"))),
-        tuple(text for text in jobs[0].get("sets", ()) if all(text in job.get("sets", ()) for job in jobs))
-        if jobs
-        else (),
+        _common(jobs),
         _provenance(ended),
     )
 
@@ -95,7 +93,11 @@ def link_to(run: Path, root: Path) -> str:
 
 def _common(jobs: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """What is set in every job."""
-    return tuple(text for text in jobs[0].get("sets", ()) if all(text in job["sets"] for job in jobs)) if jobs else ()
+    return (
+        tuple(text for text in jobs[0].get("sets", ()) if all(text in job.get("sets", ()) for job in jobs))
+        if jobs
+        else ()
+    )
 
 
 def _station(results: Mapping[str, Any]) -> str:

@@ -9,7 +9,6 @@ from drivers.wire.log_reader import LogReader
 from experiments.report import render
 from experiments.report.build import build_report
 from experiments.report.collect import collect
-from experiments.run_folder import RunFolder
 from tests.experiments.report.pages import draw_figures, draw_traces, seek
 
 
@@ -19,12 +18,6 @@ def finished(shared_command):
     done = shared_command.run("grasped_static", "--set", "stages.1.controllers=[open_loop]")
     assert done.code == 0, done.err
     return done
-
-
-@pytest.fixture
-def run(finished, tmp_path):
-    """A copy of its folder, to be damaged."""
-    return RunFolder(shutil.copytree(finished.folder, tmp_path / "run"))
 
 
 def cut(run, share):
