@@ -8,12 +8,18 @@ from typing import Self
 import numpy as np
 
 from control.settings import TrialSettings
+from drivers.errors import CommandRefused
 from drivers.interfaces import Arm, ArmTarget, Clock
 from mechanics import se2
 from mechanics.readings import Array
 
 #: the greatest speed of a minimum-jerk motion over its mean
 PEAK = 15 / 8
+#: set-points over which a motion that had to halt in its midst gathers speed again
+GATHERING = 10
+
+Path = Callable[[float], tuple[Array, Array]]
+"""Pose and twist (3,) after so many periods of a motion, fractions of one among them."""
 
 
 def quintic(s: float) -> tuple[float, float]:
@@ -22,7 +28,12 @@ def quintic(s: float) -> tuple[float, float]:
 
 
 class Mover:
-    """Sends set-points at ``rate`` [Hz]; every motion starts where the last one ended."""
+    """Sends set-points at ``rate`` [Hz]; every motion starts where the last one ended.
+
+    In real time this process may be held up in the midst of a motion, and the arm's server holds the arm (`hold_after`
+    in the station file). The motion then goes on along its path from rest, gathering speed, for no gate would let it go
+    at its speed at once. What is refused for another reason is raised.
+    """
 
     def __init__(
         self,
@@ -33,29 +44,45 @@ class Mover:
         speed: float,
         tick: Callable[[], None] = lambda: None,
         pace: float = 1.0,
+        event: Callable[[str, str], None] = lambda _level, _text: None,
     ):
         """``start`` (3,) is the present pose of the end-effector, ``speed`` [m/s] the mean speed of free motions.
 
         ``tick`` is called after each set-point. ``pace`` slows every motion down: 0.2 is a fifth of its speed.
+        ``event`` is told, with its level, where a motion had to halt.
         """
         self.pose = np.asarray(start, float)
         self.speed, self.pace = speed, pace
         self._arm, self._clock, self._period = arm, clock, 1.0 / rate
         self._sequence = self._due_ns = 0
-        self._tick = tick
+        self._tick, self._event = tick, event
 
     @classmethod
     def of(
-        cls, arm: Arm, clock: Clock, start: Array, settings: TrialSettings, tick: Callable[[], None] = lambda: None
+        cls,
+        arm: Arm,
+        clock: Clock,
+        start: Array,
+        settings: TrialSettings,
+        tick: Callable[[], None] = lambda: None,
+        event: Callable[[str, str], None] = lambda _level, _text: None,
     ) -> Self:
         """The mover that a trial's ``settings`` ask for."""
-        return cls(arm, clock, settings.control_rate, start, settings.approach_speed, tick, settings.speed)
+        return cls(arm, clock, settings.control_rate, start, settings.approach_speed, tick, settings.speed, event)
 
     def _send(self, pose: Array, twist: Array) -> None:
+        self._wait(self._command(pose, twist))
+
+    def _command(self, pose: Array, twist: Array) -> int:
+        """Send a set-point; returns when that was [ns]."""
         self._sequence += 1
         sent_ns = self._clock.now_ns()
         self._arm.command(ArmTarget(pose, twist, self._period, self._sequence))
         self.pose = pose
+        return sent_ns
+
+    def _wait(self, sent_ns: int) -> None:
+        """Until the set-point after the one sent at ``sent_ns`` is due."""
         self._clock.sleep(self._period if self._clock.lockstep else self._until_due(sent_ns))
         self._tick()
 
@@ -69,6 +96,31 @@ class Mover:
         self._due_ns = (self._due_ns if sent_ns - self._due_ns < period else sent_ns) + period
         return max(self._due_ns - self._clock.now_ns(), 0) * 1e-9
 
+    def _late(self) -> float:
+        """By how much [s] the set-point that is due is late, more than a period; 0 where it is not."""
+        late = 0.0 if self._clock.lockstep or not self._due_ns else (self._clock.now_ns() - self._due_ns) * 1e-9
+        return late if late > self._period else 0.0
+
+    def _along(self, path: Path, ticks: int) -> None:
+        """Send the set-points of a motion that takes ``ticks`` periods, and more where it has to gather speed."""
+        at, share, halted = 0.0, 1.0, ""  # how far it is, what it has of its speed, and why it halted just now
+        while at < ticks:
+            faster = min(share + 1 / GATHERING, 1.0)
+            ahead = min(at + (share + faster) / 2, ticks)
+            pose, twist = path(ahead)
+            try:
+                sent_ns = self._command(pose, faster * twist)
+            except CommandRefused as error:
+                late = self._late()  # by now: it may have been held up on its way, too
+                if halted or not late:
+                    raise
+                share, halted = 0.0, f"halted in the midst of a motion, {late:.2g} s late: {error.reason}"
+                continue
+            if halted:
+                self._event("warning", f"{halted}; it goes on from rest")
+            at, share, halted = ahead, faster, ""
+            self._wait(sent_ns)
+
     def _ticks(self, seconds: float) -> int:
         """Set-points of a motion that is meant to take ``seconds``."""
         return max(1, round(seconds / self.pace / self._period))
@@ -79,9 +131,12 @@ class Mover:
         step = np.asarray(goal, float) - start
         step[2] = se2.wrap(step[2])
         ticks = self._ticks(seconds)
-        for i in range(1, ticks + 1):
-            s, slope = quintic(i / ticks)
-            self._send(start + s * step, slope * step / (ticks * self._period))
+
+        def path(at: float) -> tuple[Array, Array]:
+            s, slope = quintic(at / ticks)
+            return start + s * step, slope * step / (ticks * self._period)
+
+        self._along(path, ticks)
 
     def through(self, path: Array, seconds: float) -> None:
         """Move along the polyline ``path`` (M, 3), one minimum-jerk time law over the whole, taking ``seconds``.
@@ -91,13 +146,16 @@ class Mover:
         points = np.concatenate([self.pose[None], np.asarray(path, float)])
         points[:, 2] = np.unwrap(points[:, 2])
         ticks = self._ticks(seconds)
-        for i in range(1, ticks + 1):
-            s, slope = quintic(i / ticks)
-            at = s * (len(points) - 1)
-            k = min(int(at), len(points) - 2)
+
+        def polyline(at: float) -> tuple[Array, Array]:
+            s, slope = quintic(at / ticks)
+            along = s * (len(points) - 1)
+            k = min(int(along), len(points) - 2)
             segment = points[k + 1] - points[k]
             twist = segment * slope * (len(points) - 1) / (ticks * self._period)
-            self._send(points[k] + (at - k) * segment, twist)
+            return points[k] + (along - k) * segment, twist
+
+        self._along(polyline, ticks)
 
     def travel(self, goal: Array) -> None:
         """Move to ``goal`` in free air at the mover's speed (60 deg/s for turns), never faster than 0.2 s."""
@@ -116,7 +174,8 @@ class Mover:
     def follow(self, pose: Array, twist: Array) -> None:
         """One set-point of a path that the caller makes up: ``pose`` (3,) and ``twist`` (3,), one period from now.
 
-        At a slower pace it is several, along a straight line.
+        At a slower pace it is several, along a straight line. One that is refused is raised: the path's time is the
+        caller's, and so is what a halt means to it.
         """
         start, goal, ticks = self.pose, np.asarray(pose, float), self._ticks(self._period)
         for i in range(1, ticks):

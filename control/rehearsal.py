@@ -53,7 +53,7 @@ class Rehearsal:
         self._plan, self._up = plan, np.append(lift * UP, 0.0)
         self._observer, self._clock, self._load = observer, clock, load
         self._settings, self._watch = settings, watch
-        self._mover = Mover.of(observer.arm, clock, observer.arm_pose(), settings, watch.tick)
+        self._mover = Mover.of(observer.arm, clock, observer.arm_pose(), settings, watch.tick, watch.event)
         self._force = 0.0
 
     def run(self) -> RehearsalResult:

@@ -90,7 +90,7 @@ class Trial:
         self._settings, self._watch = settings, watch
         self._result = TrialResult("completed", "", plan)
         self._witness_told = False
-        self._mover = Mover.of(observer.arm, clock, observer.arm_pose(), settings, watch.tick)
+        self._mover = Mover.of(observer.arm, clock, observer.arm_pose(), settings, watch.tick, watch.event)
 
     def run(self) -> TrialResult:
         """Run the whole protocol. Returns how it ended; where anything failed, the arm is held.

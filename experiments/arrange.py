@@ -36,7 +36,7 @@ def _lift(context: RunContext, devices: Devices, height: float) -> None:
     """Raise the end-effector, straight up, to where the go hangs clear of the extrinsic object; it hangs upright."""
     settings = context.settings
     here = setup.observer(context.resolved, devices, settings, context.believed).arm_pose()
-    mover = Mover.of(devices.arm, devices.clock, here, settings, context.heed)
+    mover = Mover.of(devices.arm, devices.clock, here, settings, context.heed, context.event)
     for goal in ([here[0], max(here[1], height), here[2]], [here[0], max(here[1], height), 0.0]):
         if np.abs(np.asarray(goal) - mover.pose).max() > 1e-6:
             mover.travel(np.asarray(goal, float))

@@ -156,5 +156,5 @@ def at_hand(context: RunContext, what: str) -> Iterator[Rig]:
         context.event("info", f"calibrate {what}")
         context.begin(setup.scene(context.resolved), part=1 + context.results["progress"]["stage"])
         observer = setup.observer(context.resolved, devices, context.settings, context.believed)
-        mover = Mover.of(devices.arm, devices.clock, observer.arm_pose(), context.settings, context.heed)
+        mover = Mover.of(devices.arm, devices.clock, observer.arm_pose(), context.settings, context.heed, context.event)
         yield Rig(context, devices, observer, mover)

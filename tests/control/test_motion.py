@@ -6,6 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from control.motion import Mover, quintic
+from drivers.config import ArmLimits
+from drivers.errors import CommandRefused
+from drivers.gates import Gates
 
 
 class Arm:
@@ -39,8 +42,8 @@ def clock():
     return Clock()
 
 
-def mover(arm, clock, start=(0.0, 0.0, 0.0)):
-    return Mover(arm, clock, 50.0, np.array(start), 0.05)
+def mover(arm, clock, start=(0.0, 0.0, 0.0), **more):
+    return Mover(arm, clock, 50.0, np.array(start), 0.05, **more)
 
 
 def test_the_ramp_starts_and_ends_at_rest_and_is_symmetric():
@@ -161,6 +164,99 @@ def test_in_real_time_a_long_delay_is_not_made_up_for():
     mover(arm, clock).ramp(np.array([0.01, 0.0, 0.0]), 0.2)
     after = np.diff(arm.at)[3:]
     assert (after >= 0.02 - 1e-9).all()
+
+
+class GatedArm(Arm):
+    """An arm behind its server's gates, whose watchdog holds it while no set-point comes."""
+
+    def __init__(self, clock, **limits):
+        super().__init__()
+        self.clock, self.gates = clock, Gates("arm", ArmLimits(hold_after=0.1, **limits))
+        self.gates.restart(0, np.zeros(3))
+        self.stalls = {}  # how long set-points are under way [s], by their sequence numbers
+
+    def command(self, target):
+        sent_ns = self.clock.now_ns()
+        self.clock.slept += self.stalls.get(target.sequence, 0.0)
+        now_ns = self.clock.now_ns()
+        self.gates.watch(now_ns)
+        if self.gates.stopped:
+            raise CommandRefused("arm", "command a set-point", self.gates.stopped)
+        self.gates.admit(target, sent_ns, now_ns)
+        self.gates.accept(target, now_ns)
+        super().command(target)
+
+
+def held_up(clock, at, seconds):
+    """A tick after which, at set-point ``at``, the commander is held up for so long."""
+    ticks = iter(range(1, 1000))
+
+    def tick():
+        if next(ticks) == at:
+            clock.slept += seconds
+
+    return tick
+
+
+MOTIONS = {
+    "ramp": lambda moving: moving.ramp(np.array([0.08, 0.0, 0.4]), 1.0),
+    "path": lambda moving: moving.through(np.array([[0.04, 0.0, 0.2], [0.08, 0.0, 0.4]]), 1.0),
+}
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("at", [3, 17, 25, 26, 40, 49])
+def test_a_motion_whose_commander_was_held_up_goes_on_from_rest_along_its_path(motion, at):
+    clock, told = WallClock(), []
+    arm = GatedArm(clock, acceleration=2.0)
+    moving = mover(arm, clock, tick=held_up(clock, at, 0.3), event=lambda *said: told.append(said))
+    MOTIONS[motion](moving)
+    x = np.array([target.pose[0] for target in arm.targets])
+    assert (np.diff(x) > 0).all() and x[-1] == pytest.approx(0.08)
+    assert arm.targets[-1].twist == pytest.approx([0, 0, 0], abs=1e-9)
+    refused = arm.gates.summary()["refused"]
+    assert refused in ({}, {"motion": 1})  # slow as it is at the ends, no gate minds
+    assert len(told) == sum(refused.values())
+    # what the twists say is where the next set-points are; only of where it halted, it is not
+    means, twists = np.diff(x) / 0.02, np.array([target.twist[0] for target in arm.targets])
+    off = np.abs(means - (twists[1:] + twists[:-1]) / 2) > 0.015
+    assert set(np.flatnonzero(off)) <= ({at - 1} if refused else set())
+    if 17 <= at <= 26:
+        assert refused and "halted in the midst of a motion, 0.3 s late" in told[0][1]
+
+
+def test_a_motion_goes_on_too_when_it_was_a_set_point_on_its_way_that_was_held_up():
+    clock, told = WallClock(), []
+    arm = GatedArm(clock, acceleration=2.0, age=0.2)
+    arm.stalls = {25: 0.3}
+    mover(arm, clock, event=lambda *said: told.append(said)).ramp(np.array([0.08, 0.0, 0.4]), 1.0)
+    assert arm.gates.summary()["refused"] == {"age": 1}
+    assert len(told) == 1 and "it was sent 0.30 s ago" in told[0][1]
+    assert arm.targets[-1].pose == pytest.approx([0.08, 0.0, 0.4])
+
+
+def test_a_short_delay_that_nobody_held_the_arm_for_costs_nothing():
+    clock = WallClock()
+    arm = GatedArm(clock)
+    mover(arm, clock, tick=held_up(clock, 25, 0.08)).ramp(np.array([0.08, 0.0, 0.0]), 1.0)
+    assert len(arm.targets) == 50 and not arm.gates.summary()["refused"]
+
+
+def test_what_is_refused_for_another_reason_is_raised():
+    clock = WallClock()
+    arm = GatedArm(clock, x=(-0.04, 0.04))
+    with pytest.raises(CommandRefused, match="outside the workspace"):
+        mover(arm, clock).ramp(np.array([0.08, 0.0, 0.0]), 1.0)
+    assert arm.gates.summary()["refused"] == {"workspace": 1}
+
+
+def test_a_stop_that_came_while_the_commander_was_held_up_is_raised():
+    clock, told = WallClock(), []
+    arm = GatedArm(clock, stop_after=0.2)
+    moving = mover(arm, clock, tick=held_up(clock, 25, 0.3), event=lambda *said: told.append(said))
+    with pytest.raises(CommandRefused, match=r"no set-point for 0\.3"):
+        moving.ramp(np.array([0.08, 0.0, 0.0]), 1.0)
+    assert not told
 
 
 def test_going_above_sweeps_nothing_off_the_table(arm, clock):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from control.motion import Mover
 from drivers import safety
 from drivers.config import StationConfig
 from drivers.errors import CommandRefused, DeviceTimeout, NotConnected
@@ -158,6 +159,34 @@ def test_a_commander_that_falls_silent_in_mid_motion_is_stopped(devices: Devices
         devices.clock.sleep(1.2)
         with pytest.raises(CommandRefused, match="no set-point for 1 s in the midst of a motion"):
             descend(devices, 0.001)
+
+
+@pytest.mark.timeout(60)
+def test_in_real_time_a_motion_goes_on_from_rest_after_the_arm_was_held_because_its_commander_was() -> None:
+    limits = {"acceleration": 2.0, "hold_after": 0.1, "stop_after": 20.0}
+    told: list[str] = []
+    with Station(station("realtime", arm={"kind": "arm", "limits": limits})).connect() as devices:
+        assert devices.simulation is not None
+        devices.simulation.reset(0, scene())
+        arm = devices.arm
+        assert isinstance(arm, RemoteArm)
+        here = arm.latest(2.0).pose
+        halfway = here + np.array([0.02, 0.02, 0.0])
+
+        def tick() -> None:
+            """Nothing is heard of the commander from about half the way on, until the arm is held for it."""
+            if not told and mover.pose[0] > halfway[0] and not told.append("silent"):
+                while not arm.safety()["held"]:
+                    pass
+
+        with arm.lease("test"):
+            mover = Mover(arm, devices.clock, 50.0, here, SPEED, tick, event=lambda _, said: told.append(said))
+            mover.ramp(here + np.array([0.04, 0.04, 0.3]), 1.0)
+            mover.rest(0.3)
+        assert arm.latest().pose == pytest.approx(here + np.array([0.04, 0.04, 0.3]), abs=1e-4)
+        assert told[1].startswith("halted in the midst of a motion")
+        assert all(said.startswith("halted") for said in told[1:])  # once more on a machine that does other things
+        assert arm.safety()["refused"]["motion"] == len(told) - 1 and not arm.safety()["held"]
 
 
 def test_a_reset_of_the_world_begins_the_gates_anew_but_keeps_a_stop(devices: Devices, config: StationConfig) -> None:
