@@ -51,6 +51,8 @@ _EMPTY = 128
 _LATEST = 2.0
 #: how finely it goes that way [ns], and how far behind the robot's newest pose without hurry [s]
 _PIECE_NS, _BACKLOG = 4_000_000, 0.03
+#: what a wrench takes at most from the plant to its box, by any profile [s]
+_LOADED = 0.02
 #: how far a robot strays that holds its pose [m, m, rad]; it rests where it keeps within a share of that so long [s]
 _WOBBLE, _REST, _CALM = np.array([1e-4, 1e-4, 2e-3]), 0.3, 0.2
 #: how long the picture of an untouched finger may take, which is the mean of many [s]
@@ -172,6 +174,11 @@ class EmulatedLab(Host):
         self._way = _Way(time, pose)  # what it went before is nothing to this scene
         x, y, angle = pose.tolist()
         return scene.model_copy(update={"start": (x, y, angle)})
+
+    def _staged_anew(self) -> None:
+        """Who hears of the new scene finds its weight in the box, too, however long a picture takes by then."""
+        self.world.advance(_LOADED)
+        super()._staged_anew()
 
     def _step(self, span_ns: int) -> None:
         if self._way is None:

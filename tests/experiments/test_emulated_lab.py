@@ -10,7 +10,7 @@ from mechanics.catalogue import load_object
 from mechanics.readings import TruthReading, WrenchReading
 
 #: a crowded machine falls short of real time, and the run ends as one in a laboratory would
-pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.alone, pytest.mark.timeout(300)]
 
 
 def free_port(kind):
@@ -32,7 +32,7 @@ def at_free_ports():
 @pytest.fixture(scope="module")
 def done(shared_command):
     sets = [word for text in at_free_ports() for word in ("--set", text)]
-    few = ("--set", "stages.0.parameters.steps=6")  # all twenty take three minutes of real time
+    few = ("--set", "stages.0.parameters.steps=6")  # all twenty take two minutes of real time
     process = shared_command.start_run("grasped_static", "--station", "emulated_lab", *few, *sets)
     return shared_command.finish(process, timeout=240)
 
