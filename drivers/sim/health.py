@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from math import cos, hypot, sin
 from typing import Any, NamedTuple, Protocol
 
@@ -79,7 +80,8 @@ class Health:
     """Watches one plant from its reset on. `look` costs a few microseconds per `LOOK`."""
 
     def __init__(self, patient: Patient):
-        self._patient = patient
+        # who holds the other: a plant that goes takes its memory along at once, and does not wait for the collector
+        self._patient: Patient = weakref.proxy(patient)
         self._ee = patient.ee_pose
         self._still = 0
         self._anchors: list[_Anchor] = []

@@ -13,8 +13,10 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import ChunkIndex
 from mcap.writer import CompressionType, Writer
 
 from drivers.errors import DeviceFault, ProtocolError
@@ -27,12 +29,27 @@ from mechanics.records import StatusRecord
 ROOM = 256 * 2**20
 """Bytes that may wait to be written: half a minute of everything, half a gigabyte of a stuck disk's arrears never."""
 
-_CHUNK = 4 * 2**20  # the index of every chunk stays in memory until the end: 700 bytes each
+_CHUNK = 4 * 2**20
 _TICK = 0.02
 _LAST = 60.0  # how long closing may wait for the disk [s]
 _MARGIN = 0.8  # of the flush period; the rest is for writing
 
 Job = Callable[[Writer], None]
+
+
+class _PackedIndex:
+    """A chunk's index as the bytes it will be in the file: a fifth of the object, and all stay until the end."""
+
+    __slots__ = ("_record",)
+
+    def __init__(self, index: ChunkIndex):
+        stream = RecordBuilder()
+        index.write(stream)
+        self._record = stream.end()
+
+    def write(self, stream: RecordBuilder) -> None:
+        """As `ChunkIndex.write`."""
+        stream.write(self._record)
 
 
 class LogWriter:
@@ -67,6 +84,7 @@ class LogWriter:
             raise DeviceFault("log", f"create {self.path}", str(error), "A log is never overwritten") from error
         self._writer = Writer(self._file, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library="extrinsic")
+        self._packed = 0
         self._thread = threading.Thread(target=self._run, name=f"log {self.path.name}", daemon=True)
         self._thread.start()
 
@@ -254,3 +272,11 @@ class LogWriter:
     def _sync(self) -> None:
         self._writer.flush()
         os.fsync(self._file.fileno())
+        self._pack_indices()
+
+    def _pack_indices(self) -> None:
+        """Have the indices of finished chunks take 3 MB an hour, not 20: where this mcap keeps them, or not at all."""
+        indices: list[Any] = getattr(self._writer, "_Writer__chunk_indices", [])
+        for i in range(self._packed, len(indices)):
+            indices[i] = _PackedIndex(indices[i])
+        self._packed = len(indices)

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,33 @@ def test_after_draining_everything_is_in_the_file(tmp_path: Path) -> None:
         reader = LogReader(tmp_path / "log.mcap")
         assert reader.counts() == {"sim/ft/wrench": 200}
         assert not reader.complete
+
+
+def test_a_chunk_leaves_its_index_in_the_file_and_little_in_memory(tmp_path: Path) -> None:
+    """Two chunks a second stay in the writer's memory until the end: a working day's 80 000 are to be 40 MB at most."""
+    names, chunks = [f"t{k}" for k in range(22)], 200
+    tracemalloc.start()
+    before = 0
+    try:
+        with LogWriter(tmp_path / "log.mcap", flush=1000.0) as log:
+            for i in range(chunks + 20):
+                for k, name in enumerate(names):
+                    log.write(name, messages.EMPTY, b"", sequence=i, publish_ns=i, log_ns=100 * i + k)
+                log.drain()
+                if i == 19:
+                    before = tracemalloc.get_traced_memory()[0]
+            grown = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert grown < 500 * chunks
+    with (tmp_path / "log.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None and len(summary.chunk_indexes) == chunks + 20
+        assert all(len(index.message_index_offsets) == len(names) for index in summary.chunk_indexes)
+        one = reader.iter_messages(["t7"], starting_at=10_000, ending_before=10_300)
+        found = [(message.log_time, channel.topic) for _, channel, message in one]
+    assert found == [(10_007, "t7"), (10_107, "t7"), (10_207, "t7")]
 
 
 @pytest.fixture(scope="module")
