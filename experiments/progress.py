@@ -28,6 +28,10 @@ Heard = Callable[[float], None]
 """What is told the share, from 0 to 1, of something long that is done."""
 
 
+#: the speed of something whose share is told counts from its beginning: it may be told seldom [s]
+_WHOLE = 86400.0
+
+
 def unheard(share: float) -> None:
     """Where nobody waits for it."""
 
@@ -124,8 +128,9 @@ class Progress:
             yield unheard
             return
         columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("left"))
-        with Bars(*columns, TimeRemainingColumn(), console=self.console) as bars:
+        with Bars(*columns, TimeRemainingColumn(), console=self.console, speed_estimate_period=_WHOLE) as bars:
             task = bars.add_task(escape(what), total=1.0)
+            bars.update(task, completed=1e-9)  # the first point of its speed
             yield lambda share: bars.update(task, completed=share)
 
     def say(self, level: str, text: str) -> None:

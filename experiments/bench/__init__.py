@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from rich.table import Table
 from experiments.bench import figures
 from experiments.exit_codes import ExitCode
 from experiments.json_output import beside, put
-from experiments.progress import Progress
+from experiments.progress import Heard, Progress, unheard
 from experiments.terminal import terminal
 from mechanics.yaml_input import InputError, Problem, nearest, one_of
 
@@ -33,32 +34,32 @@ class Options:
     viewers: int | None = None
 
 
-def _sim(options: Options) -> Iterator[figures.Figure]:
+def _sim(options: Options, heard: Heard) -> Iterator[figures.Figure]:
     from experiments.bench import sim
 
-    return sim.run(options.runs or RUNS)
+    return sim.run(options.runs or RUNS, heard)
 
 
-def _estimation(options: Options) -> Iterator[figures.Figure]:
+def _estimation(options: Options, heard: Heard) -> Iterator[figures.Figure]:
     from experiments.bench import estimation
 
-    return estimation.run(options.runs or RUNS)
+    return estimation.run(options.runs or RUNS, heard)
 
 
-def _planning(options: Options) -> Iterator[figures.Figure]:
+def _planning(options: Options, heard: Heard) -> Iterator[figures.Figure]:
     from experiments.bench import planning
 
-    return planning.run(options.runs or RUNS, options.horizons or planning.HORIZONS)
+    return planning.run(options.runs or RUNS, options.horizons or planning.HORIZONS, heard)
 
 
-def _load(options: Options) -> Iterator[figures.Figure]:
+def _load(options: Options, _: Heard) -> Iterator[figures.Figure]:
     from experiments.bench import load
 
     viewers = load.VIEWERS if options.viewers is None else options.viewers
     return load.run(options.minutes or load.MINUTES, viewers)
 
 
-def _bus(options: Options) -> Iterator[figures.Figure]:
+def _bus(options: Options, _: Heard) -> Iterator[figures.Figure]:
     from experiments.bench import bus
 
     return bus.run(bus.SECONDS if options.minutes is None else 60.0 * options.minutes)
@@ -77,13 +78,25 @@ def _seconds(name: str, options: Options) -> float | None:
     return None
 
 
+@contextmanager
+def _progress(name: str, options: Options, progress: Progress) -> Iterator[Heard]:
+    """The time left, by the clock or by the parts that are done; what is yielded is to be told their share."""
+    seconds = _seconds(name, options)
+    if seconds is None and progress.console.is_terminal:
+        with progress.share(f"bench {name}") as heard:
+            yield heard
+    else:
+        with progress.step(f"bench {name}", seconds):
+            yield unheard
+
+
 def _side_by_side(measured: Sequence[figures.Figure]) -> Table:
     from experiments.bench import planning_table
 
     return planning_table.side_by_side(measured)
 
 
-BENCHMARKS: dict[str, Callable[[Options], Iterator[figures.Figure]]] = {
+BENCHMARKS: dict[str, Callable[[Options, Heard], Iterator[figures.Figure]]] = {
     "sim": _sim,
     "estimation": _estimation,
     "planning": _planning,
@@ -129,8 +142,8 @@ def main(name: str, options: Options, json_file: Path | None, out: Path | None, 
     targets = figures.targets_of(name)
     said = terminal(stderr=True)
     measured: list[figures.Figure] = []
-    with Progress(said).step(f"bench {name}", _seconds(name, options)):
-        for figure in BENCHMARKS[name](options):
+    with _progress(name, options, Progress(said)) as heard:
+        for figure in BENCHMARKS[name](options, heard):
             measured.append(figure)
             said.print(f"{figure.name}: {figure.median:.3g} {figure.unit}", highlight=False, markup=False)
     console = beside(json_file, FILE_WIDTH)

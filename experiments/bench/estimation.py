@@ -14,10 +14,11 @@ from estimation.force_torque import FreeAirLoad, WristSensor
 from estimation.grasp_filter import GraspFilter
 from estimation.state import StateEstimator
 from experiments.bench import contact, identification
-from experiments.bench.figures import Figure, figure_of, median_of, seconds
+from experiments.bench.figures import Figure, Part, figure_of, in_parts, median_of, seconds
 from experiments.bench.tactile import Row, accuracy, random_grasps
 from experiments.bench.tactile_gel import FAMILIES, GRASPS
 from experiments.calibrate.threads import one_thread
+from experiments.progress import Heard, unheard
 from mechanics.catalogue import load_sensor
 from mechanics.elasticity import Elasticity
 from mechanics.readings import PoseReading, Stamp, WrenchReading
@@ -28,18 +29,26 @@ GRASPS_PER_RUN = 20
 MS = 1_000_000
 
 
-def run(runs: int = 5) -> Iterator[Figure]:
+def run(runs: int = 5, heard: Heard = unheard) -> Iterator[Figure]:
     """Measure everything, figure by figure, linear algebra on one thread."""
+    seeds = max(2, runs // 2)
+    parts: list[Part] = [
+        (15 * runs, lambda: _poses("soft_bubble", runs)),
+        (35 * runs, lambda: _poses("gelslim", runs)),
+        (0.1 * runs, lambda: [_update(runs)]),
+        (4 * runs, lambda: contact.run(runs)),
+        (40 * seeds, lambda: identification.elasticity(seeds)),
+        (1.5 * runs, lambda: identification.friction(4 * runs)),
+    ]
     with one_thread():
-        for sensor in ("soft_bubble", "gelslim"):
-            places = GRASPS if sensor == "gelslim" else None
-            grasps = random_grasps(FAMILIES[sensor], GRASPS_PER_RUN * runs, SEED, places)
-            for row in accuracy(sensor, grasps, SEED, FAMILIES):
-                yield from _pose(sensor, row)
-        yield _update(runs)
-        yield from contact.run(runs)
-        yield from identification.elasticity(max(2, runs // 2))
-        yield from identification.friction(4 * runs)
+        yield from in_parts(parts, heard)
+
+
+def _poses(sensor: str, runs: int) -> Iterator[Figure]:
+    places = GRASPS if sensor == "gelslim" else None
+    grasps = random_grasps(FAMILIES[sensor], GRASPS_PER_RUN * runs, SEED, places)
+    for row in accuracy(sensor, grasps, SEED, FAMILIES):
+        yield from _pose(sensor, row)
 
 
 def _pose(sensor: str, row: Row) -> Iterator[Figure]:

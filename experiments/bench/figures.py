@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 import experiments
+from experiments.progress import Heard, unheard
 from experiments.provenance import provenance
 from mechanics.yaml_input import parse, read_yaml
 
@@ -90,6 +91,19 @@ def seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
+Part = tuple[float, Callable[[], Iterable[Figure]]]
+"""About how long a part of a benchmark takes [s], of which only the ratios count, and what measures it."""
+
+
+def in_parts(parts: Sequence[Part], heard: Heard = unheard) -> Iterator[Figure]:
+    """The figures of all ``parts``; ``heard`` is told what share of the work is done after each."""
+    whole, done = sum(takes for takes, _ in parts), 0.0
+    for takes, measure in parts:
+        yield from measure()
+        done += takes
+        heard(done / whole)
+
+
 def shortfalls(figures: Iterable[Figure], targets: dict[str, Target]) -> list[str]:
     """A line for each figure that misses its target, and for each target that nothing measured."""
     measured = {figure.name: figure for figure in figures}
@@ -99,7 +113,8 @@ def shortfalls(figures: Iterable[Figure], targets: dict[str, Target]) -> list[st
             lines.append(f"{name}: not measured, target {target}")
         elif not target.holds(measured[name].median):
             figure = measured[name]
-            lines.append(f"{name}: {figure.median:.3g} {figure.unit}, target {target} ({target.source})")
+            what = f"; {figure.what}" if figure.what else ""
+            lines.append(f"{name}: {figure.median:.3g} {figure.unit}, target {target} ({target.source}){what}")
     return lines
 
 

@@ -101,8 +101,7 @@ def run(minutes: float = MINUTES, viewers: int = VIEWERS, sets: Sequence[str] = 
             raise NotConnected("runner", "end in order", _reason(runner, out), "`extrinsic run` tells more")
         yield from losses(results["log"])
         yield _slowest(resolved.station, out / results["log"]["file"])
-        period = 1.0 / resolved.experiment.trial.control_rate
-        ticks = load_ticks.ticks_of(load_ticks.read_sleeps(sleeps), period)
+        ticks = load_ticks.ticks_of(load_ticks.read_sleeps(sleeps))
         yield from load_ticks.figures(ticks, seen.phases, viewers)
         yield _looked(lookers, seen)
         yield from seen.figures()

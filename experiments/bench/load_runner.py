@@ -10,23 +10,21 @@ from __future__ import annotations
 import json
 import os
 import signal
-import struct
 import sys
 import threading
 import time
 from collections.abc import Callable
-from math import isclose
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
+from control.motion import Mover
 from drivers.hosting import HostProcess
+from drivers.interfaces import Clock
 from drivers.wire.clock import RemoteClock
 from experiments import runner
+from experiments.bench.load_ticks import SLEEP
 from experiments.files import load
 from experiments.terminal import terminal
-
-SLEEP = struct.Struct("<ddd")
-"""When a sleep began [s, monotonic], how long it was to take, how long it took [s]."""
 
 
 class _Told(HostProcess):
@@ -41,19 +39,40 @@ def _say(**said: object) -> None:
     sys.stdout.flush()
 
 
-def time_sleeps(told: Callable[[float, float, float], None]) -> None:
+class _LoopClock:
+    """A clock as a control loop has it: the sleep that is under way is the loop's."""
+
+    def __init__(self, clock: Clock):
+        self._clock, self.lockstep, self.now_ns = clock, clock.lockstep, clock.now_ns
+        self.asleep = False
+
+    def sleep(self, seconds: float) -> None:
+        """As the clock's."""
+        self.asleep = True
+        try:
+            self._clock.sleep(seconds)
+        finally:
+            self.asleep = False
+
+
+def time_sleeps(told: Callable[[float, float, float, bool], None]) -> None:
     """Have every sleep of this process's clocks told: its begin [s, monotonic], what was asked for, what it took [s].
 
-    What lies between two sleeps is the work of a control loop, and what a sleep took too long its lateness.
+    And whether it is one between two set-points: what lies between two of those is the work of the control loop, and
+    what such a sleep took too long its lateness.
     """
-    sleep = RemoteClock.sleep
+    sleep, begin_motion, loops = RemoteClock.sleep, Mover.__init__, []
+
+    def moves(self: Mover, arm: Any, clock: Clock, *rest: Any, **named: Any) -> None:
+        loops[:] = [_LoopClock(clock)]
+        begin_motion(self, arm, loops[0], *rest, **named)
 
     def timed(self: RemoteClock, seconds: float) -> None:
-        begin = time.monotonic()
+        own, begin = any(loop.asleep for loop in loops), time.monotonic()
         sleep(self, seconds)
-        told(begin, seconds, time.monotonic() - begin)
+        told(begin, seconds, time.monotonic() - begin, own)
 
-    RemoteClock.sleep = timed
+    Mover.__init__, RemoteClock.sleep = moves, timed
 
 
 def _interrupt_with_input() -> None:
@@ -69,12 +88,11 @@ def main() -> int:
     # into a file, not a list: the process's own memory is among what is measured
     with Path(order["sleeps"]).open("wb") as file:
         resolved, looping = load(order["experiment"], None, order["sets"]), False
-        period = 1.0 / resolved.experiment.trial.control_rate
 
-        def note(begin: float, asked: float, took: float) -> None:
+        def note(begin: float, asked: float, took: float, own: bool) -> None:
             nonlocal looping
-            file.write(SLEEP.pack(begin, asked, took))
-            if not looping and isclose(asked, period, rel_tol=1e-6):
+            file.write(SLEEP.pack(begin, asked, took, own))
+            if own and not looping:
                 looping = True
                 _say(loop=True)
 

@@ -7,6 +7,7 @@ together are its period.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,9 @@ import numpy as np
 from experiments.bench.figures import Figure
 from experiments.statistics import mean
 from mechanics.readings import Array
+
+SLEEP = struct.Struct("<4d")
+"""When a sleep began [s, monotonic], how long it was to take, how long it took [s]; 1 if it is the control loop's."""
 
 #: a phase in which the loop ticked less often tells nothing: the run was between two trials
 FEWEST = 20
@@ -38,14 +42,14 @@ class Ticks:
         return Ticks(self.at[kept], self.work[kept], self.late[kept], self.period[kept])
 
 
-def ticks_of(sleeps: Array, period: float) -> Ticks:
-    """The ticks between ``sleeps`` (n, 3): begin [s, monotonic], what was asked for, what it took [s].
+def ticks_of(sleeps: Array) -> Ticks:
+    """The ticks between ``sleeps`` (n, 4): begin [s, monotonic], what was asked for, what it took [s], 1 if the loop's.
 
-    A tick lies between two sleeps of a loop's ``period`` [s] and ends with the second; other sleeps (waits between
-    trials) begin and end none.
+    A tick lies between two sleeps of the loop and ends with the second; other sleeps (waits between motions) begin and
+    end none.
     """
-    begin, asked, took = np.asarray(sleeps, float).reshape(-1, 3).T
-    own = np.isclose(asked, period, rtol=1e-6)
+    begin, asked, took, kind = np.asarray(sleeps, float).reshape(-1, 4).T
+    own = kind == 1
     both = own[1:] & own[:-1]
     woke, work = (begin + took)[:-1][both], (begin[1:] - (begin + took)[:-1])[both]
     late = (took - asked)[1:][both]
@@ -53,9 +57,9 @@ def ticks_of(sleeps: Array, period: float) -> Ticks:
 
 
 def read_sleeps(path: Path) -> Array:
-    """The sleeps (n, 3) of a file that `experiments.bench.load_runner` writes; an unfinished last one is left out."""
+    """The sleeps (n, 4) of a file that `experiments.bench.load_runner` writes; an unfinished last one is left out."""
     data = path.read_bytes()
-    return np.frombuffer(data[: len(data) // 24 * 24], "<f8").reshape(-1, 3)
+    return np.frombuffer(data[: len(data) // SLEEP.size * SLEEP.size], "<f8").reshape(-1, 4)
 
 
 @dataclass(frozen=True)
@@ -104,19 +108,19 @@ def figures(ticks: Ticks, phases: Sequence[Phase], viewers: int) -> list[Figure]
     found: list[Figure | None] = []
     for looking, said in ((False, "without viewers"), (True, f"with {viewers} viewers")):
         parts = [ticks.within(phase.begin, phase.end) for phase in phases if phase.viewers is looking]
+        if not any(part.at.size for part in parts):  # the run ended too soon
+            continue
+        periods = np.concatenate([part.period for part in parts])
         for name, values in (
             (f"loop, work per tick, {said}", np.concatenate([part.work for part in parts])),
             (f"loop, lateness per tick, {said}", np.concatenate([part.late for part in parts])),
-            (f"loop, period, {said}", np.concatenate([part.period for part in parts])),
+            (f"loop, period, {said}", periods),
         ):
-            if values.size:
-                low, middle, high = (float(q) * 1e3 for q in np.quantile(values, (0.05, 0.5, 0.95)))
-                found.append(Figure(name, middle, low, high, "ms", values.size, "median, 5 % and 95 % of the ticks"))
-        periods = np.concatenate([part.period for part in parts])
-        if periods.size:
-            late = 100 * float((periods > LATE * np.median(ticks.period)).mean())
-            what = f"ticks that took longer than {LATE:g} times the median"
-            found.append(Figure(f"loop, late ticks, {said}", late, late, late, "%", periods.size, what))
+            low, middle, high = (float(q) * 1e3 for q in np.quantile(values, (0.05, 0.5, 0.95)))
+            found.append(Figure(name, middle, low, high, "ms", values.size, "median, 5 % and 95 % of the ticks"))
+        late = 100 * float((periods > LATE * np.median(ticks.period)).mean())
+        what = f"ticks that took longer than {LATE:g} times the median"
+        found.append(Figure(f"loop, late ticks, {said}", late, late, late, "%", periods.size, what))
     pairs = "geometric mean over pairs of phases, with its 95 % interval"
     found += [
         ratio(f"loop, {name}: viewers", ticks, phases, of, pairs)

@@ -21,12 +21,13 @@ from typing import Any
 import numpy as np
 
 from experiments import registries
-from experiments.bench.figures import Figure, figure_of
+from experiments.bench.figures import Figure, Part, figure_of, in_parts
 from experiments.bench.planning_case import Case
 from experiments.bench.planning_optimisers import at_other_slack_weights, from_elsewhere, others
 from experiments.bench.planning_problem import described, disturbed, pivoting_pentagon
 from experiments.bench.planning_timing import Watched, apart, repeated
 from experiments.planning.make import objective
+from experiments.progress import Heard, unheard
 from mechanics.readings import Array
 from planning.optimisers.base import Optimum
 from planning.problem import Form
@@ -42,30 +43,47 @@ FEW = 2
 NEARBY, AWAY = 3, 0.1
 
 
-def run(runs: int = 5, horizons: Sequence[int] = HORIZONS) -> Iterator[Figure]:
+def run(runs: int = 5, horizons: Sequence[int] = HORIZONS, heard: Heard = unheard) -> Iterator[Figure]:
     """Measure everything, figure by figure."""
-    yield _second_start(runs)
     shortest, longest = min(horizons), max(horizons)
     cost: dict[str, dict[int, float]] = {f"fused, {GRAD}": {}, "fused, lm": {}}
+    parts: list[Part] = [(7, lambda: [_second_start(runs)])]
     for form, steps in [*((Form.PAPER, steps) for steps in horizons), (Form.CLOSED, shortest)]:
-        problem = pivoting_pentagon(steps, form)
-        made = {name: objective(name)(problem) for name in NAMES}
-        start = disturbed(problem, made["fused"], np.random.default_rng(0))
-        case = Case(problem, made, start, runs, steps == shortest)
-        yield from _accuracy(case)
-        yield from _gradient(case)
-        yield from others(case)
-        if case.whole:
-            yield from from_elsewhere(case)
-        if form is Form.PAPER:
-            if case.whole:
-                yield from at_other_slack_weights(case)
-            for method, found in cost.items():
-                found[steps] = case.known[method, "iteration"] / steps
+        parts += _problem(form, steps, steps == shortest, runs, cost)
+    yield from in_parts(parts, heard)
     if shortest < longest:
         for method, found in cost.items():
             name = f"{method}, paper form: cost of an iteration and step, {shortest} to {longest} steps"
             yield figure_of(name, [found[longest] / found[shortest]], "×")
+
+
+def _problem(form: Form, steps: int, whole: bool, runs: int, cost: dict[str, dict[int, float]]) -> list[Part]:
+    """The parts of a problem: all are about one case, made where the first begins, and ``cost`` is what they found."""
+    case: list[Case] = []
+
+    def begin() -> Iterator[Figure]:
+        problem = pivoting_pentagon(steps, form)
+        made = {name: objective(name)(problem) for name in NAMES}
+        case.append(Case(problem, made, disturbed(problem, made["fused"], np.random.default_rng(0)), runs, whole))
+        return _accuracy(case[0])
+
+    def end() -> Iterator[Figure]:
+        yield from others(case[0])
+        if whole:
+            yield from from_elsewhere(case[0])
+        if form is Form.PAPER:
+            if whole:
+                yield from at_other_slack_weights(case[0])
+            for method, found in cost.items():
+                found[steps] = case[0].known[method, "iteration"] / steps
+
+    through_cvxpylayers = (20 if form is Form.PAPER else 90) if whole else 0.015 * steps
+    compiled = (3 + 0.02 * steps) * runs  # most of it is the plans through torch
+    return [
+        (3 + 0.035 * steps, begin),
+        (through_cvxpylayers + compiled, lambda: _gradient(case[0])),
+        (8 if whole else 0.02 * steps, end),
+    ]
 
 
 # -- accuracy --------------------------------------------------------------------------------------------------------

@@ -18,9 +18,10 @@ from drivers.sim.plant import Plant
 from drivers.sim.world import World
 from drivers.station import Station
 from experiments import runner, setup
-from experiments.bench.figures import Figure, figure_of, median_of, seconds
+from experiments.bench.figures import Figure, figure_of, in_parts, median_of, seconds
 from experiments.files import Resolved, load
 from experiments.ports import free_endpoint
+from experiments.progress import Heard, unheard
 from mechanics import se2
 
 X_REAL = "× real time"
@@ -30,14 +31,20 @@ COMPILING = 120.0
 PRESS = 1e-3
 
 
-def run(runs: int = 5) -> Iterator[Figure]:
+def run(runs: int = 5, heard: Heard = unheard) -> Iterator[Figure]:
     """Measure everything, figure by figure."""
     resolved = load("grasped_static", None, [f"bus.endpoint={free_endpoint()}"])
-    yield _plant_alone(resolved, runs)
-    yield _world("plant, arm and two force/torque sensors", resolved, ("arm", "force_torque", "gripper"), runs)
-    yield from _frames(resolved, runs)
-    yield _everything(resolved, runs)
-    yield _trial(resolved, max(2, runs // 2))
+    kinds = ("arm", "force_torque", "gripper")
+    yield from in_parts(
+        [
+            (3, lambda: [_plant_alone(resolved, runs)]),
+            (1, lambda: [_world("plant, arm and two force/torque sensors", resolved, kinds, runs)]),
+            (4, lambda: _frames(resolved, runs)),
+            (4 * runs, lambda: [_everything(resolved, runs)]),
+            (25 * max(2, runs // 2), lambda: [_trial(resolved, max(2, runs // 2))]),
+        ],
+        heard,
+    )
 
 
 def _touching(resolved: Resolved) -> Scene:

@@ -93,11 +93,8 @@ def link_to(run: Path, root: Path) -> str:
 
 def _common(jobs: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """What is set in every job."""
-    return (
-        tuple(text for text in jobs[0].get("sets", ()) if all(text in job.get("sets", ()) for job in jobs))
-        if jobs
-        else ()
-    )
+    first = jobs[0].get("sets", ()) if jobs else ()
+    return tuple(text for text in first if all(text in job.get("sets", ()) for job in jobs))
 
 
 def _station(results: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from scipy import stats
 
 from experiments.bench import Options, load, main
 from experiments.bench.figures import Figure, targets_of
-from experiments.bench.load_ticks import Ticks, ratio, schedule, ticks_of
+from experiments.bench.load_ticks import Ticks, figures, ratio, schedule, ticks_of
 from experiments.bench.memory import own_memory, slope
 from mechanics.yaml_input import InputError
 
@@ -88,18 +88,18 @@ def test_what_a_process_has_for_itself_is_what_it_filled_and_an_ended_one_has_no
 def test_a_tick_is_what_lies_between_two_sleeps_of_the_loop():
     sleeps = np.array(
         [
-            [10.0, 0.02, 0.021],  # wakes at 10.021
-            [10.024, 0.02, 0.020],  # worked 3 ms, slept on time, wakes at 10.044
-            [10.050, 0.2, 0.2],  # waits for something else
-            [11.0, 0.02, 0.025],
-            [11.030, 0.02, 0.022],  # worked 5 ms, 2 ms late
+            [10.0, 0.02, 0.021, 1],  # wakes at 10.021
+            [10.024, 0.017, 0.017, 1],  # worked 3 ms, slept on time, wakes at 10.041
+            [10.050, 0.02, 0.02, 0],  # waits for something else, whose time says nothing
+            [11.0, 0.02, 0.025, 1],
+            [11.030, 0.01, 0.012, 1],  # worked 5 ms, 2 ms late
         ]
     )
-    found = ticks_of(sleeps, 0.02)
+    found = ticks_of(sleeps)
     np.testing.assert_allclose(found.at, [10.021, 11.025])
     np.testing.assert_allclose(found.work, [0.003, 0.005], atol=1e-9)
     np.testing.assert_allclose(found.late, [0.0, 0.002], atol=1e-9)
-    np.testing.assert_allclose(found.period, [0.023, 0.027], atol=1e-9)
+    np.testing.assert_allclose(found.period, [0.020, 0.017], atol=1e-9)
 
 
 def test_phases_fill_their_time_in_pairs_and_a_drift_favours_neither_kind():
@@ -136,6 +136,7 @@ def test_phases_without_ticks_tell_nothing():
     phases = schedule(0.0, 8.0, 30.0, 0.1)
     nothing = Ticks(*(np.zeros(0),) * 4)
     assert ratio("work", nothing, phases, lambda part: float(part.work.mean()), "") is None
+    assert figures(nothing, phases, 4) == figures(nothing, [], 4) == []
 
 
 # -- losses -----------------------------------------------------------------------------------------------------------
@@ -162,7 +163,7 @@ def test_a_loss_is_a_gap_or_what_was_published_and_not_logged_or_a_stream_that_i
 SMALL = [f"devices.finger_{side}.{key}" for side in ("left", "right") for key in ("width=64", "height=48", "rate=10")]
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_a_few_seconds_of_load_give_every_figure_and_lose_nothing():
     sets = [*SMALL, "devices.camera.rate=1", "devices.wrist_ft.rate=200", "devices.table_ft.rate=200"]
     found = {figure.name: figure for figure in load.run(0.07, 1, [*sets, "world.timestep=0.002"])}
