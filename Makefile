@@ -48,7 +48,7 @@ demo: setup  ## calibrate, plan, tip a pentagon over its corner and report, in a
 	@$(BIN)/extrinsic run experiments/demo.yaml --set world.profile=lab
 
 test: setup browser usb  ## the default test suite
-	@$(BIN)/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder -m 'not slow and not alone' tests/experiments tests  # the long ones first
+	@$(BIN)/python -m pytest -n 2 --max-worker-restart 0 --dist loadscope --no-loadscope-reorder -m 'not slow and not alone' tests/experiments tests  # the long ones first
 	@$(BIN)/python -m pytest -m 'alone and not slow'  # in real time, beside an emulated robot: nothing else at a time
 
 test-slow: setup browser usb  ## the long tests
