@@ -17,7 +17,7 @@ from drivers.errors import DeviceFault, DeviceTimeout, NotConnected
 from drivers.finger_frames import DEPTH_UNIT
 from drivers.real.bubble_config import DepthLens, RealSenseBubbleConfig
 from drivers.real.guarded import guarded
-from drivers.real.realsense import chosen, library, offered, resolved, set_option
+from drivers.real.realsense import chosen, library, offered, resolved, rest, set_option
 from mechanics.camera import CameraModel
 
 #: frames that wait in the library while this process is held up: half a second
@@ -28,6 +28,8 @@ _LENS_AGREES = 0.25
 _STOP = 2.0
 #: who is so far behind a recording's pace does not make up for it [s]
 _HELD_UP = 0.5
+#: a recording's frames come at once; after so long without any, whether it has ended is asked [s]
+_AT_ONCE = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +73,8 @@ class DepthStream:
             file = Path(config.recording).expanduser()
             if not file.is_file():
                 raise self._not_reached("there is no such file", "Correct `recording`")
-            asked.enable_device_from_file(str(file), repeat_playback=config.loop)
+            # not repeated by the library, which ends this process where it is stopped just then (librealsense 2.59)
+            asked.enable_device_from_file(str(file), repeat_playback=False)
         else:
             camera = chosen(rs, self.device, self.asked, config.serial, timeout)
             asked.enable_device(camera)
@@ -94,6 +97,8 @@ class DepthStream:
         except RuntimeError as error:
             with suppress(RuntimeError):
                 pipeline.stop()
+            if config.recording:
+                rest(pipeline, profile)
             remedy = "Record it anew" if config.recording else "Plug it in again; see whether another program has it"
             raise self._not_reached(str(error), remedy) from error
         self._rs, self._pipeline, self._playback, self._fetch = rs, pipeline, playback, fetch
@@ -124,10 +129,11 @@ class DepthStream:
         rs, fetch = self._rs, self._fetch
         assert fetch is not None
         try:
-            got, frame = fetch(max(1, round(timeout * 1e3)))
+            wait = timeout if self._playback is None else min(timeout, _AT_ONCE)
+            got, frame = fetch(max(1, round(wait * 1e3)))
             if not got:
                 if self._playback is not None and self._playback.current_status() == rs.playback_status.stopped:
-                    raise self.ended()
+                    self._at_its_end()
                 return None
             arrival = time.time_ns()
             depth = frame.as_frameset().get_depth_frame() if frame.is_frameset() else frame.as_depth_frame()
@@ -148,6 +154,14 @@ class DepthStream:
         unix = self._playback is None and domain != rs.timestamp_domain.hardware_clock
         return DepthFrame(number, told, unix, arrival, self._steps[raw[self._picked]])
 
+    def _at_its_end(self) -> None:
+        """Begin the recording again where it loops. Raises DeviceTimeout where it does not."""
+        if not self._config.loop:
+            raise self.ended()
+        pace = self._pace
+        self.open(_STOP)
+        self._pace = pace
+
     def ended(self) -> DeviceTimeout:
         """What is raised at a recording's end."""
         return DeviceTimeout(
@@ -160,10 +174,13 @@ class DepthStream:
     def close(self) -> None:
         """Stop it, however it is; idempotent."""
         pipeline, self._pipeline = self._pipeline, None
-        self._fetch = self._playback = self._waiting = None
+        playback, self._playback = self._playback, None
+        self._fetch = self._waiting = None
         if pipeline is not None:
             with suppress(RuntimeError, TimeoutError):
                 guarded(pipeline.stop, _STOP)
+            if playback is not None:
+                rest(pipeline, playback)
 
     def _check(self, rs: Any, profile: Any) -> None:
         """Whether it is the camera of the station file, with its lens; and set what is to be set before it starts."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import DeviceFault, NotConnected
 from drivers.real.frames import FrameSource
-from drivers.real.realsense import RECORDINGS, chosen, library, resolved
+from drivers.real.realsense import RECORDINGS, chosen, library, resolved, rest
 from drivers.streaming import POLL
 
 
@@ -36,6 +36,7 @@ class RealsenseSource(FrameSource):
         super().__init__(name, address, rate=rate, delay=delay, silence=silence)
         self._wanted, self._size = serial, size
         self._pipeline: Any = None
+        self._profile: Any = None
         self._fps, self._frame = 0, -1
 
     def _reach(self, timeout: float) -> None:
@@ -54,7 +55,7 @@ class RealsenseSource(FrameSource):
             profile = pipeline.start(config)
         except RuntimeError as error:
             raise self._not_reached(str(error), remedy) from error
-        self._pipeline = pipeline
+        self._pipeline, self._profile = pipeline, profile
         self._fps, self._frame = profile.get_stream(rs.stream.color).fps(), -1
         self.serial = profile.get_device().get_info(rs.camera_info.serial_number)
 
@@ -81,7 +82,18 @@ class RealsenseSource(FrameSource):
 
     def _detach(self) -> Callable[[], object]:
         pipeline, self._pipeline = self._pipeline, None
-        return (lambda: None) if pipeline is None else pipeline.stop
+        profile, self._profile = self._profile, None
+
+        def stop() -> None:
+            if pipeline is None:
+                return
+            try:
+                pipeline.stop()
+            finally:
+                if self._wanted.endswith(RECORDINGS):
+                    rest(pipeline, profile)
+
+        return stop
 
 
 def _converted(name: str, image: NDArray[np.uint8], rgb: bool, grey: bool) -> NDArray[np.uint8]:

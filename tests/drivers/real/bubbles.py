@@ -122,6 +122,10 @@ def bubble_playback(folder: Path) -> dict[str, Any]:
     return entry(**size, lens=lens, recording=str(file), loop=True, reference="take")
 
 
+#: what stood for cameras. The library ends a process where such a thing goes while one of its threads is at work
+_PLAYERS: list[Any] = []
+
+
 class Ports:
     """Stands for the module pyrealsense2, with recordings that are plugged in as if they were live cameras."""
 
@@ -143,6 +147,7 @@ class Ports:
 
     def plug(self, file: Path) -> None:
         self._plugged = file, self._context.load_device(str(file))
+        _PLAYERS.append(self._plugged[1])
 
     def unplug(self) -> None:
         if self._plugged is not None:

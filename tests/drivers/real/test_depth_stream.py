@@ -1,14 +1,20 @@
 """A RealSense's units of depth and options, and the pace of its recordings."""
 
+import subprocess
+import sys
 import threading
+import weakref
+from collections import deque
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from drivers.errors import NotConnected
+from drivers.real import realsense
 from drivers.real.depth_stream import _Pace, depth_steps
 from drivers.real.realsense import resolved, set_option
+from tests.drivers.real.bubbles import bubble
 
 
 @pytest.mark.parametrize("unit", [1e-4, 1e-3, 2.5e-4, 1e-5])
@@ -105,3 +111,68 @@ def test_a_library_that_does_not_answer_is_not_waited_for():
             resolved("finger_left", "connect", None, config, 0.1, str)
     finally:
         hung.set()
+
+
+#: opens and closes a recording at any moment, and says so at the end, unless the library ends it first
+_OFTEN = """
+import random, sys, time
+from pathlib import Path
+from drivers.real.depth_stream import DepthStream
+from drivers.real.realsense_bubble import RealSenseBubbleConfig
+from tests.drivers.real.bubbles import LENS, entry, dome, record
+file = record(Path(sys.argv[1]), [dome(320, 240, LENS)] * 6)
+moments = random.Random(int(sys.argv[2]))
+for n in range(400):
+    stream = DepthStream("finger", RealSenseBubbleConfig.model_validate(entry(recording=str(file), loop=True)))
+    stream.open(5.0)
+    for _ in range(moments.randint(0, 10)):
+        stream.take(0.05)
+    time.sleep(moments.uniform(0.0, 0.05))
+    stream.close()
+print("all")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_recording_may_be_opened_and_closed_at_any_moment(rs, tmp_path):
+    children = [  # beside one another: it is where threads are held up that the library lost its way
+        subprocess.Popen(
+            [sys.executable, "-c", _OFTEN, str(tmp_path / f"{n}.db3"), str(n)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for n in range(6)
+    ]
+    try:
+        ended = [(child.communicate(timeout=500), child.returncode) for child in children]
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+    for (out, err), code in ended:
+        assert (code, out) == (0, "all\n"), err
+
+
+def test_what_has_played_a_recording_outlives_its_stop(still, monkeypatch):
+    now = 100.0
+    monkeypatch.setattr(realsense, "_rested", deque())
+    monkeypatch.setattr(realsense, "time", SimpleNamespace(monotonic=lambda: now))
+    player = threading.Event()
+    gone = weakref.ref(player)
+    realsense.rest(player)
+    del player
+    now += 4.9
+    realsense.rest()
+    assert gone() is not None
+    now += 0.2
+    realsense.rest()
+    assert gone() is None
+    monkeypatch.undo()
+
+    monkeypatch.setattr(realsense, "_rested", rested := deque())
+    with bubble(recording=str(still)) as finger:
+        finger.latest()
+    ((_, (pipeline, playback)),) = rested
+    assert type(pipeline).__name__ == "pipeline" and playback.is_playback()
